@@ -13,8 +13,10 @@
 # make image   builds the container images and proves what docs/operations.md says of them
 # make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
 # make eval-scenes   labelled scenes of held-out things, rendered to target/eval/scenes (g++, PYTHON)
+# make bench-all   what docs/benchmarks.md has no rows of this tree for, as far as two cores can measure it
+# make bench-gpu   the same of what needs a GPU. Both: BENCH=--list prints the commands; SEGSPLAT_LAB and
+#               SEGSPLAT_BIN name programs that are built already
 # make report   the tables of docs/benchmarks.md from benches/runs
-# make plots   docs/plots from docs/measurements/runs (PYTHON with matplotlib)
 # make test-long   the random tests with many more cases, and the slow ones
 # make fuzz    every reader of bytes from outside, FUZZ_SECONDS=600 each
 
@@ -24,12 +26,12 @@ TARGET := $(or $(CARGO_TARGET_DIR),target)
 SEGSPLAT := $(TARGET)/release/segsplat
 DATA ?= $(or $(SEGSPLAT_SHARED_DATA),../shared/data)/scenes
 ARGS ?=
-# With numpy, pillow and trimesh for `make eval-scenes`, matplotlib for `make plots`.
+# With numpy, pillow and trimesh for `make eval-scenes`.
 PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: unread client venv page page-long wheel image proto judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-published judge-splats judge-three judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: unread client venv page page-long wheel image proto judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-published judge-splats judge-three judge-tools demo serve check test test-long fuzz bench bench-all bench-gpu lab eval eval-scenes report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -166,15 +168,23 @@ LAB := $(CARGO) run --locked --release -p segsplat-lab --
 eval: setup
 	$(LAB) photos $(DATA) $(ARGS)
 
+# The laboratory and the server, which it starts, are built without each other: the product has no feature `testing`.
+LAB_PROGRAM = $(or $(SEGSPLAT_LAB),$(TARGET)/release/segsplat-lab)
+lab: build
+	$(CARGO) build --locked --release -p segsplat-lab
+
+bench-all: $(if $(SEGSPLAT_LAB),,lab)
+	$(LAB_PROGRAM) bench cpu $(BENCH)
+
+bench-gpu: $(if $(SEGSPLAT_LAB),,lab)
+	$(LAB_PROGRAM) bench gpu $(BENCH)
+
 report:
 	$(LAB) report $(ARGS)
 
 eval-scenes:
 	$(PYTHON) models/training/semantics/eval_scenes.py --data $(dir $(DATA)) \
 		--out $(TARGET)/eval/scenes
-
-plots:
-	$(PYTHON) benches/plots.py docs/measurements/runs docs/plots
 
 build: setup
 	$(CARGO) build --locked --release

@@ -123,7 +123,7 @@ impl Stages {
     /// All tiles into pictures that every request has.
     fn rasterize(&self, request: &RenderRequest, width: Width, scratch: &mut TileScratch) {
         let options = KernelOptions { width, ..KernelOptions::default() };
-        let paint = Paint::new(request, &self.view, self.gaussians.semantic_index(), options);
+        let paint = Paint::new(request, &self.view, self.gaussians.semantic_index(), 0.0, options);
         let stride = (SIDE * TILE) as usize;
         let (mut color, mut depth) = (vec![[0.0; 3]; stride], vec![0.0; stride]);
         let mut blend = vec![[0.0; 4]; stride];

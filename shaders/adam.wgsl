@@ -9,7 +9,7 @@
 // [N, K, 3], flattened.
 @group(0) @binding(5) var<storage, read_write> sh: array<f32>;
 // [1 + 2 * numbers, N]: steps taken, then two moments of each number: mean, quaternion, scales,
-// opacity, harmonics.
+// opacity, harmonics. Under 0 steps: it is new, and what the moments hold is of another.
 @group(0) @binding(6) var<storage, read_write> moments: array<f32>;
 // Gradients of the photos before this one, of the same step.
 @group(0) @binding(7) var<storage, read> earlier: array<f32>;
@@ -25,18 +25,21 @@ const SH_LEARNT_MAX: f32 = 64.0;
 var<private> own: u32;
 var<private> total: u32;
 var<private> corrected: vec2<f32>;
+var<private> is_new: bool;
 
 // The step of number k, in units of its rate.
 fn step_of(k: u32, gradient: f32) -> f32 {
     let at = (1u + 2u * k) * total + own;
-    let after = moments_after(vec2(moments[at], moments[at + total]), gradient);
+    let before = select(vec2(moments[at], moments[at + total]), vec2(0.0), is_new);
+    let after = moments_after(before, gradient);
     moments[at] = after.x;
     moments[at + total] = after.y;
     return step_by(after, corrected);
 }
 
 fn move_seen(gaussian: ptr<function, Gaussian>) {
-    let count = min(moments[own] + 1.0, COUNT_MAX);
+    is_new = moments[own] < 0.0;
+    let count = min(max(moments[own], 0.0) + 1.0, COUNT_MAX);
     moments[own] = count;
     corrected = corrections(count);
     let row = own * GRADIENT_WORDS;

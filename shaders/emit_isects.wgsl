@@ -10,6 +10,7 @@
 @group(0) @binding(5) var<storage, read_write> ends: array<atomic<u32>>;
 // [2][views][capacity] of (depth key, Gaussian).
 @group(0) @binding(6) var<storage, read_write> pairs: array<vec2<u32>>;
+@group(0) @binding(7) var<storage, read> rows: array<u32>;
 
 // Whether pairs get their places, or are counted in bins for that.
 var<private> placing: bool;
@@ -34,7 +35,7 @@ fn main(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let i = enter_row(group, groups, local);
+    let i = enter_gaussian(group, groups, local);
     let total = views[which].gaussian_count;
     let first = which * total;
     begin_visits(local);

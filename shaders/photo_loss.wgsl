@@ -204,7 +204,8 @@ fn main(
         var by_x = -share * (by.x + 2.0 * x * by.y + y * by.z) + each * sign(x - y);
         by_x = select(0.0, by_x, photo.w > 0.0);
         let place = place_of(at, channel);
-        by_pictures[place] = by_x * exposures[training.photo * EXPOSURE_WORDS + channel];
+        let by_shown = by_x * exposures[training.photo * EXPOSURE_WORDS + channel];
+        by_pictures[place] = select(by_shown, abs(x - y), training.blames != 0u);
         numbers = vec3(pictures[place] * by_x, by_x, abs(x - y));
     }
     let by_gain = sum_of(local, numbers.x);

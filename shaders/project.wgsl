@@ -10,6 +10,7 @@
 @group(0) @binding(5) var<storage, read_write> ends: array<atomic<u32>>;
 // Photos of the views.
 @group(0) @binding(6) var<storage, read> sources: array<Source>;
+@group(0) @binding(7) var<storage, read> rows: array<u32>;
 
 // How a view blurs a Gaussian that it shows larger or smaller than its photo did
 // (crates/render/src/plan.rs).
@@ -118,7 +119,7 @@ fn main(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let i = enter_row(group, groups, local);
+    let i = enter_gaussian(group, groups, local);
     let first = which * views[which].gaussian_count;
     if local == 0u {
         atomicStore(&seen, 0u);

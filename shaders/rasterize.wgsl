@@ -100,7 +100,8 @@ fn blend(q: u32, some: bool, one: vec2<f32>, weight: vec4<f32>, paint: vec4<f32>
     let hit = some && one.x <= weight.z && alpha >= ALPHA_MIN && !pixels[q].done;
     let ends = hit && left <= TRANSMITTANCE_MIN;
     let adds = hit && !ends;
-    pixels[q].done = pixels[q].done || ends;
+    let ended = ends || (adds && left <= views[which].ray_end.x);
+    pixels[q].done = pixels[q].done || ended;
     // Colours, depths and rows are finite: nothing of them adds 0.
     let share = select(0.0, alpha * transmittance, adds);
     if WITH_COLOR {
@@ -135,23 +136,27 @@ fn level(value: f32) -> u32 {
     return u32(clamp(value, 0.0, 1.0) * 255.0 + 0.5);
 }
 
-// The colour of a pixel, over what is behind it.
-fn composed(q: u32, alpha: f32, corner: vec2<f32>) -> vec3<f32> {
-    let room = 1.0 - alpha;
+// The colour of a pixel, over what is behind it. `left` is the light of a ray that ended early.
+fn composed(q: u32, left: f32, corner: vec2<f32>) -> vec3<f32> {
+    let color = pixels[q].color + left * views[which].ray_end.y;
+    let room = 1.0 - min(pixels[q].alpha + left, 1.0);
     if views[which].backdrop_start == NO_PICTURE {
-        return pixels[q].color + room * views[which].background.xyz;
+        return color + room * views[which].background.xyz;
     }
     if room < views[which].room_min {
-        return pixels[q].color;
+        return color;
     }
-    return pixels[q].color + room * backdrop_behind(corner + pixels[q].center - 0.5);
+    return color + room * backdrop_behind(corner + pixels[q].center - 0.5);
 }
 
 fn store(q: u32, corner: vec2<f32>) {
     let at = pixels[q].at;
-    let alpha = min(pixels[q].alpha, 1.0);
+    let transmittance = pixels[q].transmittance;
+    let left = select(0.0, transmittance, transmittance <= views[which].ray_end.x);
+    // What is behind such a ray is between nothing and all.
+    let alpha = min(pixels[q].alpha + 0.5 * left, 1.0);
     if WITH_COLOR && views[which].color_start != NO_PICTURE {
-        let out = composed(q, alpha, corner);
+        let out = composed(q, left, corner);
         let rgb = level(out.x) | (level(out.y) << 8u) | (level(out.z) << 16u);
         if views[which].levels == LEVELS_RGB {
             rgbs[q] = rgb;
@@ -172,6 +177,7 @@ fn store(q: u32, corner: vec2<f32>) {
     if views[which].alpha_start != NO_PICTURE {
         pictures[views[which].alpha_start + at] = bitcast<u32>(alpha);
     }
+    pixels[q].alpha = alpha;
     store_labels(q, at);
 }
 

@@ -9,6 +9,8 @@
 @group(0) @binding(3) var<storage, read> tiles: array<u32>;
 // [views][N, 3], flattened.
 @group(0) @binding(4) var<storage, read_write> colors: array<f32>;
+@group(0) @binding(5) var<storage, read_write> plans: array<Plan>;
+@group(0) @binding(6) var<storage, read> rows: array<u32>;
 
 @compute @workgroup_size(256)
 fn main(
@@ -16,7 +18,7 @@ fn main(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let i = enter_row(group, groups, local);
+    let i = enter_gaussian(group, groups, local);
     let total = views[which].gaussian_count;
     if i >= total || views[which].color_start == NO_PICTURE || tiles[which * total + i] == 0u {
         return;

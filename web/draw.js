@@ -358,28 +358,6 @@ class Drawing {
     this.changed();
   }
 
-  // The parts of a word, the best first: each with the mean relevancy of its Gaussians as its
-  // score, and a box without the farthest of them. Boxes are in the world, Gaussians about the
-  // origin.
-  async partsOf({ parts, scores, entries }) {
-    const origin = this.header.origin,
-      boxes = parts.map((part) => ({ ...part, center: add(part.center, origin, -1) }));
-    this.worker.postMessage({ parts: boxes, scores, selected: entries });
-    const found = await new Promise((go) => this.asking.push(go));
-    const better = parts.map((part, i) => {
-      if (!found[i]) return { ...part, score: 0 };
-      const { score, ends } = found[i],
-        shift = ends.map(([low, high], k) => (0.5 * (low + high)) * part.size[k]);
-      return {
-        ...part,
-        score,
-        center: part.axes.reduce((at, axis, k) => add(at, axis, shift[k]), part.center),
-        size: ends.map(([low, high], k) => (high - low) * part.size[k]),
-      };
-    });
-    return better.sort((a, b) => b.score - a.score);
-  }
-
   // The thing at a point of the world: its entry, of how many, its Gaussians, and a box along these
   // axes; null where nothing has an entry.
   async thingAt(point, entry, axes) {

@@ -556,7 +556,7 @@ async function find(text) {
       stop = new AbortController();
     if (!state.understood) watchUnderstanding(id, stop.signal);
     try {
-      const body = JSON.stringify({ texts: [text], boxes: 'upright' });
+      const body = JSON.stringify({ texts: [text] });
       const answer = await server.json(`/v1/scenes/${id}/query`, { method: 'POST', body });
       if (state.scene.id !== id) return; // another scene was opened meanwhile
       result = answer.results[0];
@@ -569,13 +569,13 @@ async function find(text) {
     // Entries of the Gaussians are new: once.
     if (!state.understood) await load(id, state.camera);
   }
-  const [parts, known] = await Promise.all([drawing.partsOf(result), knownWord(text)]);
+  const known = await knownWord(result);
   if (state.scene?.id !== scene) return;
   if (state.words.length === WORDS.length) state.words.shift();
   const score = Math.max(0, ...result.scores);
-  state.words.push({ ...result, parts, score, known, cut: Number($('cut').value) });
+  state.words.push({ ...result, score, known, cut: Number($('cut').value) });
   showWords();
-  const n = parts.length,
+  const n = result.parts.length,
     where = `${count(result.gaussians)} Gaussians in ${n} part${n === 1 ? '' : 's'}`;
   say(
     [
@@ -596,20 +596,16 @@ async function watchUnderstanding(id, signal) {
   }
 }
 
-// What was measured of the last word of a text: { trust, words } with how many words were. Null
-// where the server does not say, trust null of a word that was not measured.
-async function knownWord(text) {
+// What was measured of the word of an answer: { trust, word, words } with how many words were. Null
+// where the server does not say, trust null of a text about no word that was measured.
+async function knownWord({ word, trust }) {
+  if (trust) return { trust, word };
   if (state.alone) return null;
-  const all = await server.models().then(
-    ({ words }) => words,
-    () => [],
+  const words = await server.models().then(
+    (models) => models.words.length,
+    () => 0,
   );
-  if (!all.length) return null;
-  const asked = text.toLowerCase(),
-    last = asked.split(/\s+/).pop();
-  const is = (name) => all.find(({ word }) => word.toLowerCase() === name);
-  const found = is(asked) || is(last) || is(last.replace(/s$/, ''));
-  return { trust: found?.trust || null, word: found?.word, words: all.length };
+  return words ? { trust: null, words } : null;
 }
 
 // What makes an answer doubtful, as far as was measured.

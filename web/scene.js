@@ -47,54 +47,9 @@ async function readPacked(stream, head, part) {
 }
 
 // Runs in the worker, which has all places. A counting sort of 16 bits, farthest first: a key is
-// the upper bits of the f32 depth; what is behind has the top bit. And what the Gaussians in the
-// boxes of a word's parts tell: how well they fit, and where nearly all of them are.
+// the upper bits of the f32 depth; what is behind has the top bit. And the thing at a place.
 function sorter() {
-  const BINS = 256,
-    OUTSIDE = 0.02; // share of Gaussians beyond each side of a box
-  // Low and high end of the middle of a histogram, in bins.
-  const middle = (bins, total) => {
-    const end = (from, step) => {
-      let left = OUTSIDE * total,
-        at = from;
-      while ((left -= bins[at]) > 0) at += step;
-      return at;
-    };
-    return [end(0, 1), end(BINS - 1, -1) + 1];
-  };
-  const measured = ({ parts, scores, selected }) => {
-    const chosen = new Uint8Array(0x10000);
-    for (const entry of selected) chosen[entry] = 1;
-    const sums = parts.map(() => ({ total: 0, score: 0 })),
-      bins = parts.map(() => [0, 1, 2].map(() => new Uint32Array(BINS)));
-    const rows = parts.map(({ center, axes, size }) =>
-      axes.map(([x, y, z], k) => [x, y, z, center, Math.max(size[k], 1e-30)]),
-    );
-    const at = [0, 0, 0];
-    for (let i = 0; i < known; i++) {
-      if (!chosen[entries[i]]) continue;
-      for (let p = 0; p < parts.length; p++) {
-        let inside = true;
-        for (let k = 0; k < 3 && inside; k++) {
-          const [x, y, z, c, size] = rows[p][k];
-          let along = x * (places[3 * i] - c[0]) + y * (places[3 * i + 1] - c[1]);
-          along += z * (places[3 * i + 2] - c[2]);
-          at[k] = (along / size + 0.5) * BINS;
-          inside = at[k] > -1 && at[k] < BINS + 1;
-        }
-        if (!inside) continue;
-        sums[p].total++;
-        sums[p].score += scores[entries[i] - 1];
-        for (let k = 0; k < 3; k++)
-          bins[p][k][Math.max(0, Math.min(BINS - 1, Math.floor(at[k])))]++;
-      }
-    }
-    return sums.map(({ total, score }, p) => {
-      if (!total) return null;
-      const ends = bins[p].map((of) => middle(of, total).map((bin) => bin / BINS - 0.5));
-      return { score: score / total, ends };
-    });
-  };
+  const OUTSIDE = 0.02; // share of Gaussians beyond each side of a box
   // The Gaussians of an entry that touch each other around a place, as far as `reach` from one to
   // the next: how many they are, and the two ends along each axis of where nearly all of them are.
   // Without an entry it is that of the Gaussian nearest to the place.
@@ -147,9 +102,7 @@ function sorter() {
     known = 0;
   let depths = new Float32Array(0);
   onmessage = ({ data }) => {
-    if (data.parts) {
-      postMessage({ measured: measured(data) });
-    } else if (data.place) {
+    if (data.place) {
       postMessage({ measured: thing(data) });
     } else if (data.count !== undefined) {
       places = new Float32Array(3 * data.count);

@@ -134,7 +134,7 @@ with torch.inference_mode():
         ):
             found.setdefault(f"segsplat {name}", []).append(value)
 row = {
-    **{key: first[key] for key in ("commit", "machine", "gaussians", "width", "height")},
+    **{key: first[key] for key in ("commit", "machine", "hashes", "gaussians", "width", "height")},
     "table": "gsplat",
     "command": f"gsplat_peer.py SITE OUT LAB --gaussians {args.gaussians} --width {args.width} "
                f"--height {args.height} --frames {args.frames} --rounds {args.rounds}",

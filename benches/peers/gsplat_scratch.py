@@ -32,6 +32,7 @@ parser.add_argument("--photos", type=int, default=20)
 parser.add_argument("--seconds", default="5")
 parser.add_argument("--seed", type=int, default=1)
 parser.add_argument("--machine", default="one NVIDIA H200, 16 cores")
+parser.add_argument("--hashes", type=json.loads, default={}, help="of `report --hashes`")
 parser.add_argument("--commit", default="")
 args = parser.parse_args()
 sys.path.insert(0, args.site)
@@ -185,6 +186,7 @@ for at, name in enumerate(args.scenes.split(",")):
         row = {
             "table": "scratch",
             "command": "benches/peers/gsplat_scratch.py SITE OUT SCENES",
+            "hashes": args.hashes,
             "commit": args.commit,
             "machine": args.machine,
             "unix_s": int(time.time()),

@@ -131,7 +131,7 @@ for _ in range(args.rounds):
     ):
         found.setdefault(f"segsplat {name}", []).append(value)
 row = {
-    **{key: first[key] for key in ("commit", "machine", "gaussians", "width", "height",
+    **{key: first[key] for key in ("commit", "machine", "hashes", "gaussians", "width", "height",
                                    "visible", "intersections")},
     "table": "gsplat-step",
     "command": f"gsplat_step.py SITE OUT LAB --gaussians {args.gaussians} --width {args.width} "

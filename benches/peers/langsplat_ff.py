@@ -309,6 +309,7 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     parser.add_argument("--table", default="langsplat-ff")
+    parser.add_argument("--hashes", type=json.loads, default={}, help="of `report --hashes`")
     parser.add_argument("--commit", default="")
     parser.add_argument("--machine", default="this machine")
     args = parser.parse_args()
@@ -337,6 +338,7 @@ def main():
             source = {
                 "table": args.table,
                 "command": command,
+                "hashes": args.hashes,
                 "commit": args.commit,
                 "machine": args.machine,
                 "unix_s": int(time.time()),

@@ -133,6 +133,7 @@ def main():
     parser.add_argument("--runs", type=int, default=9)
     parser.add_argument("--networks", default="of the bundle", help="what the row calls them")
     parser.add_argument("--machine", default="this machine")
+    parser.add_argument("--hashes", type=json.loads, default={}, help="of `report --hashes`")
     parser.add_argument("--commit", default="")
     args = parser.parse_args()
     files, transforms = photos(args.scene, args.frames, args.side)
@@ -147,6 +148,7 @@ def main():
     row = {
         "table": "paper-time",
         "command": "benches/published/runtime.py URL SCENE OUT; segsplat serve --bundle BUNDLE",
+        "hashes": args.hashes,
         "commit": args.commit,
         "machine": args.machine,
         "unix_s": int(time.time()),

@@ -80,6 +80,7 @@ def main():
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--machine", required=True, help="in words")
+    parser.add_argument("--hashes", type=json.loads, default={}, help="of `report --hashes`")
     parser.add_argument("--out", type=pathlib.Path)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -127,6 +128,7 @@ def main():
             result = {"table": "python", "command": f"compare.py --callers {args.callers} "
                       f"--seconds {args.seconds:g} --size {args.size} --threads {args.threads}",
                       "commit": commit.stdout.strip(), "machine": args.machine,
+                      "hashes": args.hashes,
                       "error": {"levels_max": float(max(a.max() for a in apart)),
                                 "levels_mean": float(max(a.mean() for a in apart))},
                       "gaussians": gaussians, "size": args.size, "callers": args.callers,

@@ -2,17 +2,21 @@
 //! `docs/benchmarks.md`. It is not published and the server does not use it.
 //!
 //! Each command prints one JSON row for each thing that it measures, and appends the rows to the
-//! file that `--out` names. A row holds its command, its commit, its machine and its error
-//! ([`rows`]). `report` makes the tables of the page from the rows ([`report`]).
+//! file that `--out` names. A row holds its command, its commit, its machine, its error and the
+//! hashes of what was measured ([`rows`]). `bench` runs the commands of the tables that have no row
+//! of this tree, and `report` makes the tables of the page from the rows ([`report`]).
 
+mod bench;
 mod density;
 mod frames;
 mod grid;
+mod kept;
 mod load;
 mod many;
 mod masks;
 pub mod metrics;
 mod networks;
+mod pairs;
 mod photos;
 mod refinements;
 pub mod report;
@@ -20,6 +24,8 @@ pub mod rows;
 pub mod scenes;
 pub mod semantics;
 mod setup;
+mod sources;
+mod tables;
 pub mod triples;
 pub mod warp;
 pub mod words;
@@ -53,6 +59,10 @@ enum Command {
     Many(many::Args),
     /// Compare thinned scenes with scenes of all Gaussians
     Density(setup::Inputs),
+    /// Compare views that show scenes smaller than their photos with those of their own size
+    Afar(setup::Inputs),
+    /// Compare files of Gaussians with the Gaussians that went in
+    Exports(setup::Inputs),
     /// Compare what texts select with labels
     Semantics(semantics::Args),
     /// Compare the shortcuts of the mask stage
@@ -67,9 +77,15 @@ enum Command {
     Backward(frames::Args),
     /// Time frames without each kind of skipped work
     Skips(frames::Args),
+    /// What views cost that show little of a scene, with and without blocks
+    Aims(frames::Args),
+    /// Time frames that may differ from the exact ones by so much
+    Frontier(frames::frontier::FrontierArgs),
     /// Ask a server for views and scenes, as its callers do
     #[command(subcommand)]
     Load(load::Command),
+    /// Measure what docs/benchmarks.md has no rows of this tree for
+    Bench(bench::Args),
     /// Write the tables of docs/benchmarks.md from the rows
     Report(report::Args),
 }
@@ -102,6 +118,8 @@ pub fn run(cli: &Cli) -> Result<Vec<serde_json::Value>> {
         Command::Photos(args) => photos::run(args, &mut rows)?,
         Command::Many(args) => many::run(args, &mut rows)?,
         Command::Density(args) => density::run(args, &mut rows)?,
+        Command::Afar(inputs) => pairs::afar(inputs, &mut rows)?,
+        Command::Exports(inputs) => pairs::exports(inputs, &mut rows)?,
         Command::Semantics(args) => semantics::run(args, &mut rows)?,
         Command::Masks(args) => masks::run(args, &mut rows)?,
         Command::Words(args) => words::run(args, &mut rows)?,
@@ -109,7 +127,10 @@ pub fn run(cli: &Cli) -> Result<Vec<serde_json::Value>> {
         Command::Frames(args) => frames::run(args, &mut rows)?,
         Command::Backward(args) => frames::backward::run(args, &mut rows)?,
         Command::Skips(args) => frames::skips::run(args, &mut rows)?,
+        Command::Aims(args) => frames::aims::run(args, &mut rows)?,
+        Command::Frontier(args) => frames::frontier::run(args, &mut rows)?,
         Command::Load(command) => load::run(command, &mut rows)?,
+        Command::Bench(args) => bench::run(args, &cli.record)?,
         Command::Report(args) => report::run(args)?,
     }
     Ok(rows.into_all())

@@ -16,7 +16,7 @@ use crate::{
     error::{Error, Result},
     grid,
     limits::Limits,
-    metrics::{clamped, psnr},
+    metrics::{clamped, psnr, ssim},
     photo_files,
     pipeline::{Pipeline, refinement::refined},
     refine::{held_out, split},
@@ -92,6 +92,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         };
         let judge =
             |gaussians: &Gaussians| mean_psnr(&targets, |camera| one_set(gaussians, camera));
+        let similarity =
+            |gaussians: &Gaussians| mean_ssim(&targets, |camera| one_set(gaussians, camera));
         let as_served = |camera| {
             let plain = view_request(camera, Kinds::COLOR, scene.meta.report.median_depth);
             renderer.render(&scene.gaussians, &served(&scene, plain))
@@ -145,6 +147,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             let found = refined(renderer, &scene, &given, &options, &mut remake, &mut pace)?;
             let refine_ms = ms(begun) - rested.as_secs_f64() * 1e3;
             row["refine"] = json!(text);
+            row["asked_s"] = json!(variant.asked_s());
             row["refine_ms"] = json!(refine_ms);
             row["step_ms"] = json!(refine_ms / f64::from(paces.max(1)));
             row["steps_made"] = json!(paces);
@@ -159,6 +162,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             if let Some((_, version)) = &found.version {
                 row["refined_psnr"] = json!(judge(&version.gaussians)?);
                 row["refined_gaussians"] = json!(version.gaussians.len());
+                row["refined_ssim"] = json!(similarity(&version.gaussians)?);
                 picture(text, one_set(&version.gaussians, camera)?)?;
             }
             progress(&format!("{name}: {row}"));
@@ -186,6 +190,17 @@ fn mean_psnr(targets: &[PosedPhoto], draw: impl Fn(Camera) -> Result<Frame>) -> 
         let frame = draw(target.camera)?;
         let truth = unit(&target.photo);
         sum += psnr(&clamped(frame.color), &truth, target.photo.valid.as_deref());
+    }
+    Ok(sum / targets.len() as f64)
+}
+
+/// The same for SSIM.
+fn mean_ssim(targets: &[PosedPhoto], draw: impl Fn(Camera) -> Result<Frame>) -> Result<f64> {
+    let mut sum = 0.0;
+    for target in targets {
+        let (shown, truth) = (clamped(draw(target.camera)?.color), unit(&target.photo));
+        let (width, valid) = (target.photo.width as usize, target.photo.valid.as_deref());
+        sum += ssim(&shown, &truth, width, valid);
     }
     Ok(sum / targets.len() as f64)
 }

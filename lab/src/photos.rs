@@ -39,9 +39,9 @@ pub(crate) struct Args {
     /// Triples at work at the same time
     #[arg(long, default_value_t = 1)]
     at_once: usize,
-    /// Take every n-th triple only
-    #[arg(long, default_value_t = 1)]
-    every: usize,
+    /// Most triples of a scene, spread evenly [default: all]
+    #[arg(long)]
+    most: Option<usize>,
     /// How scenes are made and drawn: default, or paper
     #[arg(long, value_parser = named::<Preset>, default_value = "default")]
     preset: Preset,
@@ -63,8 +63,8 @@ pub(crate) struct Args {
 /// the pipeline says, with scene and triple named.
 pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let photos = args.inputs.photos;
-    if photos < 2 || args.at_once == 0 || args.every == 0 {
-        return Err(Error::invalid("photos must be at least 2, at-once and every at least 1"));
+    if photos < 2 || args.at_once == 0 || args.most == Some(0) {
+        return Err(Error::invalid("photos must be at least 2, at-once and most at least 1"));
     }
     let threads = args.inputs.setup.threads();
     let at_once = args.at_once.min(threads);
@@ -80,7 +80,9 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let mut scenes = Vec::new();
     for (name, dir) in args.inputs.find(is_posed)? {
         let squares = squares(&dir)?;
-        let chosen: Vec<Triple> = triples(&squares).into_iter().step_by(args.every).collect();
+        let all = triples(&squares);
+        let count = args.most.map_or(all.len(), |most| most.min(all.len()));
+        let chosen: Vec<Triple> = (0..count).map(|k| all[k * all.len() / count]).collect();
         let mut judged = each(chosen.len(), at_once, |i| {
             judge(&engine, &renderer, &squares, &chosen[i], method).map_err(|e| {
                 let target = &squares[chosen[i].target].file;

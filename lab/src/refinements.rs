@@ -21,7 +21,12 @@ pub(crate) struct Variant {
     steps: u32,
     ms: u64,
     side: u32,
+    gaussians_first: usize,
+    gaussians_a_pixel: f32,
     gaussians_max: usize,
+    growth: f32,
+    coarse_share: f32,
+    patience: u32,
     batch: usize,
     prune_every: u32,
     opacity_min: f32,
@@ -49,7 +54,12 @@ impl Default for Variant {
             steps: u32::MAX,
             ms: u64::MAX,
             side: plain.side,
+            gaussians_first: plain.gaussians_first,
+            gaussians_a_pixel: plain.gaussians_a_pixel,
             gaussians_max: plain.gaussians_max,
+            growth: plain.growth,
+            coarse_share: plain.coarse_share,
+            patience: plain.patience,
             batch: plain.batch,
             prune_every: plain.prune_every,
             opacity_min: plain.opacity_min,
@@ -77,6 +87,11 @@ impl Variant {
         if self.layers { (made.clone(), made.gaussians) } else { (made, one_set) }
     }
 
+    /// Seconds that it was given; none where it counts steps.
+    pub(crate) fn asked_s(&self) -> Option<f64> {
+        (self.ms < u64::MAX).then_some(self.ms as f64 / 1e3)
+    }
+
     /// The options of the product with these in their place.
     pub(crate) fn options(&self) -> RefineOptions {
         let plain = RefineOptions::default();
@@ -93,7 +108,12 @@ impl Variant {
                 sh: rates.sh * self.sh,
                 sh_rest: rates.sh_rest * self.sh,
             },
+            gaussians_first: self.gaussians_first,
+            gaussians_a_pixel: self.gaussians_a_pixel,
             gaussians_max: self.gaussians_max,
+            growth: self.growth,
+            coarse_share: self.coarse_share,
+            patience: self.patience,
             opacity_min: self.opacity_min,
             prune_every: self.prune_every,
             ssim_share: self.ssim_share,

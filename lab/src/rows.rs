@@ -1,9 +1,10 @@
 //! Rows of measurements: one JSON object a line. Every row says what was run, of which commit, on
-//! which machine, and how large the error of the measured thing is.
+//! which machine, and how large the error of the measured thing is, and has the hashes of what the
+//! measured code was built from ([`crate::sources`]).
 
 use std::{
     io::Write as _,
-    path::PathBuf,
+    path::{Path, PathBuf},
     process::Command,
     time::{Instant, SystemTime, UNIX_EPOCH},
 };
@@ -27,15 +28,50 @@ pub(crate) struct Record {
     /// The machine, in words [default: its processor and cores]
     #[arg(long, global = true, env = "SEGSPLAT_MACHINE")]
     machine: Option<String>,
+    /// The command as the rows name it [default: this process's arguments]
+    #[arg(long, global = true, hide = true)]
+    command: Option<String>,
+}
+
+impl Record {
+    /// Of a process that measures a part of it: `table`, into `out`, by `command`.
+    pub(crate) fn arguments(&self, out: &Path, table: &str, command: &str) -> Vec<String> {
+        let path = out.to_string_lossy().into_owned();
+        let pairs = [
+            ("--out", Some(path)),
+            ("--table", Some(table.to_owned())),
+            ("--command", Some(command.to_owned())),
+            ("--commit", self.commit.clone()),
+            ("--machine", self.machine.clone()),
+        ];
+        let pairs = pairs.into_iter().filter_map(|(name, value)| Some((name, value?)));
+        pairs.flat_map(|(name, value)| [name.to_owned(), value]).collect()
+    }
+
+    /// Whether it is known which commit is measured.
+    pub(crate) fn names_commit(&self) -> bool {
+        self.commit.as_ref().is_some_and(|name| !name.is_empty()) || !commit().is_empty()
+    }
+
+    /// The file of `--out`.
+    pub(crate) fn out(&self) -> Option<&Path> {
+        self.out.as_deref()
+    }
 }
 
 /// Options of [`Record`], which are no part of the command that a row names.
-const OWN_OPTIONS: [&str; 4] = ["--out", "--table", "--commit", "--machine"];
+const OWN_OPTIONS: [&str; 5] = ["--out", "--table", "--commit", "--machine", "--command"];
+
+/// The hashes of what this program was built from, by group.
+pub(crate) fn built_from() -> Map<String, Value> {
+    let pairs = env!("SEGSPLAT_SOURCES").split(' ').filter_map(|pair| pair.split_once('='));
+    pairs.map(|(group, hash)| (group.to_owned(), json!(hash))).collect()
+}
 
 /// Writes rows, and keeps them.
 #[derive(Debug)]
 pub(crate) struct Rows {
-    /// Table, command, commit and machine.
+    /// Table, command, commit, machine and hashes.
     source: Map<String, Value>,
     file: Option<fs_err::File>,
     rows: Vec<Value>,
@@ -52,9 +88,10 @@ impl Rows {
         let text = |text: String| Value::String(text);
         let source = [
             ("table", text(record.table.clone())),
-            ("command", text(command(std::env::args().skip(1)))),
+            ("command", text(record.command.clone().unwrap_or_else(of_this_process))),
             ("commit", text(record.commit.clone().unwrap_or_else(commit))),
             ("machine", text(record.machine.clone().unwrap_or_else(machine))),
+            ("hashes", Value::Object(built_from())),
         ];
         Ok(Self {
             source: source.into_iter().map(|(key, value)| (key.to_owned(), value)).collect(),
@@ -70,9 +107,8 @@ impl Rows {
     /// `internal` where the file cannot be written.
     #[expect(clippy::print_stdout, reason = "the rows are the answer of the program")]
     pub(crate) fn push(&mut self, error: Value, values: Value) -> Result<()> {
-        let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let mut row = self.source.clone();
-        row.insert("unix_s".to_owned(), since.as_secs().into());
+        row.insert("unix_s".to_owned(), unix_s().into());
         row.insert("error".to_owned(), error);
         if let Value::Object(values) = values {
             row.extend(values);
@@ -117,6 +153,24 @@ pub(crate) fn progress(what: &str) {
     eprintln!("{what}");
 }
 
+/// Seconds since 1970.
+pub(crate) fn unix_s() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()
+}
+
+/// The day of a time in UTC: `2026-11-25`.
+pub(crate) fn day(unix_s: u64) -> String {
+    // Days are counted in 400 years from 1 March 0000, where the leap day is a year's last.
+    let days = unix_s / 86_400 + 719_468;
+    let (era, day) = (days / 146_097, days % 146_097);
+    let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;
+    let of_year = day - (365 * year + year / 4 - year / 100);
+    let month = (5 * of_year + 2) / 153;
+    let of_month = of_year - (153 * month + 2) / 5 + 1;
+    let (next, month) = if month < 10 { (0, month + 3) } else { (1, month - 9) };
+    format!("{}-{month:02}-{of_month:02}", era * 400 + year + next)
+}
+
 /// Milliseconds since `begun`.
 pub(crate) fn ms(begun: Instant) -> f64 {
     begun.elapsed().as_secs_f64() * 1e3
@@ -159,10 +213,10 @@ pub(crate) fn each<T: Send>(
     Ok(found.into_iter().map(|(_, one)| one).collect())
 }
 
-/// The command line without [`OWN_OPTIONS`].
-fn command(arguments: impl Iterator<Item = String>) -> String {
+/// This process's command line without [`OWN_OPTIONS`].
+fn of_this_process() -> String {
     let (mut words, mut skip) = (vec!["segsplat-lab".to_owned()], false);
-    for word in arguments {
+    for word in std::env::args().skip(1) {
         let own = OWN_OPTIONS.iter().any(|option| word.starts_with(option));
         if !skip && !own {
             words.push(word.clone());

@@ -138,6 +138,13 @@ pub fn inputs(
     })
 }
 
+/// `count` of the photos that are not `asked`, evenly spread; all of them where there are no more.
+pub(crate) fn spread(photos: usize, asked: &[usize], count: usize) -> Vec<usize> {
+    let others: Vec<usize> = (0..photos).filter(|photo| !asked.contains(photo)).collect();
+    let count = count.min(others.len());
+    (0..count).map(|i| others[(2 * i + 1) * others.len() / (2 * count)]).collect()
+}
+
 /// The Gaussians of the photos.
 pub(crate) fn make(
     engine: &Pipeline,

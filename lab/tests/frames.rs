@@ -30,6 +30,22 @@ fn frames_are_timed_with_labels_and_callers() {
 }
 
 #[test]
+fn the_frontier_has_six_scenes_and_every_error_keeps_its_bound() {
+    let rows = lab(&["frontier", "--gaussians", "800", "--size", "24", "--errors", "0,8,32"]);
+    let rows = rows.unwrap();
+    assert_eq!(rows.len(), 18, "six scenes at three errors");
+    for row in &rows {
+        let number = |name: &str| row["error"][name].as_f64().unwrap();
+        let (asked, most) = (number("asked"), number("max"));
+        assert!(most <= asked + 1e-3, "{row}");
+        assert!(asked > 0.0 || number("psnr_db") > 150.0, "the first is exact: {row}");
+    }
+    let spent = rows.iter().filter(|row| row["error"]["max"].as_f64() > Some(1.0));
+    assert!(spent.count() >= 6, "errors are spent");
+    assert!(lab(&["frontier", "--gaussians", "800", "--errors", "33"]).is_err(), "33 levels");
+}
+
+#[test]
 fn a_wrong_pixel_is_a_fault_and_nan_is_far() {
     let (gaussians, _) = two_views(20, 1);
     let entries = (0..gaussians.len()).map(|i| 1 + (i % 24) as u16).collect();

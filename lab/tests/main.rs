@@ -1,6 +1,7 @@
 //! One test binary: links ONNX Runtime and wgpu once.
 #![allow(clippy::panic, clippy::print_stdout, clippy::unwrap_used, reason = "tests")]
 
+mod bench;
 mod frames;
 mod labels;
 mod metrics;

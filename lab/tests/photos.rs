@@ -12,7 +12,7 @@ fn refined_scenes_have_both_figures_and_begin_with_what_is_named() {
     sample::run(dir.path(), &options).unwrap();
     let bundle = root().join("tests/fixtures/colours");
     let of = |refine: &str| {
-        let rest = ["--photos", "5", "--every", "9", "--refine", refine];
+        let rest = ["--photos", "5", "--most", "1", "--refine", refine];
         measured("photos", &bundle, dir.path(), &rest)
     };
     let Some(rows) = of("steps=20") else { return };

@@ -142,7 +142,7 @@ pub struct ViewOptions {
     /// The part of every picture that is drawn; left out: all of it. For views alone.
     #[prost(message, optional, tag = "7")]
     pub crop: ::core::option::Option<Region>,
-    /// How closely to keep to the rendering model.
+    /// Name of an error, for clients that know no `error`.
     #[prost(enumeration = "Quality", tag = "8")]
     pub quality: i32,
     /// How it is drawn and texts are scored; left out: as the scene was made.
@@ -155,6 +155,10 @@ pub struct ViewOptions {
     /// preset.
     #[prost(bool, optional, tag = "11")]
     pub magnify: ::core::option::Option<bool>,
+    /// Largest difference to the exact picture that is accepted for less time, levels of 255: 0
+    /// (exact) to 32; left out: that of `quality`. Views with depth are exact.
+    #[prost(float, optional, tag = "12")]
+    pub error: ::core::option::Option<f32>,
 }
 /// A part of a picture, pixels of the whole one.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -259,15 +263,15 @@ impl Preset {
         }
     }
 }
-/// How closely a renderer keeps to the model.
+/// Names of two errors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Quality {
     /// As QUALITY_EXACT.
     Unspecified = 0,
-    /// f32 all through.
+    /// An error of 0.
     Exact = 1,
-    /// Faster, within the bound that the documentation states.
+    /// An error of 2 levels.
     Fast = 2,
 }
 impl Quality {
@@ -316,6 +320,10 @@ pub struct Scoring {
     /// Difference of cosines to the canonical texts at which the relevancy is 0.5.
     #[prost(double, optional, tag = "7")]
     pub margin: ::core::option::Option<f64>,
+    /// Share of the bundle's list of words that may fit an entry better than the text, 0..1; 1: the
+    /// list does not count.
+    #[prost(double, optional, tag = "8")]
+    pub rivals: ::core::option::Option<f64>,
 }
 /// Texts asked of a scene.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -385,7 +393,7 @@ pub struct TextResult {
     /// Gaussians selected.
     #[prost(uint64, tag = "4")]
     pub gaussians: u64,
-    /// Connected parts of the selection, the largest first.
+    /// Connected parts of the selection, the one with the best score first.
     #[prost(message, repeated, tag = "5")]
     pub parts: ::prost::alloc::vec::Vec<Part>,
     /// What makes the answer doubtful.
@@ -397,6 +405,12 @@ pub struct TextResult {
     /// Whether the scene has what the text names: some Gaussian is selected.
     #[prost(bool, tag = "8")]
     pub found: bool,
+    /// The measured word that the text is about: one of Models; empty where there is none.
+    #[prost(string, tag = "9")]
+    pub word: ::prost::alloc::string::String,
+    /// What to expect of that word: good, fair, poor or unmeasured; empty without one.
+    #[prost(string, tag = "10")]
+    pub trust: ::prost::alloc::string::String,
 }
 /// A connected part of a selection and its box, world frame of the upload.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -410,8 +424,8 @@ pub struct Part {
     /// Unit axes of the box, right-handed.
     #[prost(message, repeated, tag = "3")]
     pub axes: ::prost::alloc::vec::Vec<Vec3>,
-    /// Full lengths along the axes, world units. Of the centres of its Gaussians, half a per cent on
-    /// each side left out.
+    /// Full lengths along the axes, world units. The few Gaussians far from most of them are left
+    /// out.
     #[prost(message, optional, tag = "4")]
     pub size: ::core::option::Option<Vec3>,
     /// Mean centre of its Gaussians, world units.
@@ -425,6 +439,9 @@ pub struct Part {
     /// cameras.
     #[prost(float, repeated, tag = "7")]
     pub visibility: ::prost::alloc::vec::Vec<f32>,
+    /// Relevancy of its best entry, 0 to 1; of those that a tenth of its Gaussians have.
+    #[prost(float, tag = "8")]
+    pub score: f32,
 }
 /// Something that makes the answer to a text doubtful.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -535,7 +552,7 @@ pub struct Label {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Boxes {
-    /// As BOXES_ORIENTED.
+    /// As BOXES_UPRIGHT.
     Unspecified = 0,
     /// Turned along the part's own axes.
     Oriented = 1,
@@ -543,7 +560,7 @@ pub enum Boxes {
     Aligned = 2,
     /// No parts and no boxes.
     None = 3,
-    /// As BOXES_ORIENTED with the last axis up, as the photos tell it.
+    /// Turned about the upright alone, as the photos tell it: the last axis is up.
     Upright = 4,
 }
 impl Boxes {
@@ -1164,6 +1181,9 @@ pub struct View {
     /// Gaussians that passed culling.
     #[prost(uint64, tag = "12")]
     pub visible: u64,
+    /// Bound of its difference to the exact picture, levels of 255.
+    #[prost(float, tag = "13")]
+    pub error: f32,
 }
 /// Which scene to write, and how.
 #[derive(Clone, PartialEq, ::prost::Message)]

@@ -23,6 +23,8 @@ const ATAN = array<f32, 7>(
 // Numbers of the kernels: the list of crates/render/src/gpu/pipelines.rs.
 // Invocations of a workgroup, the portable floor; also the values of a radix digit.
 const WORKGROUP_SIZE: u32 = 256u;
+// Gaussians of a block.
+const BLOCK: u32 = 256u;
 // Views that one submission draws at most: the workgroup's z says which.
 const VIEWS_MAX: u32 = 8u;
 // Pairs of a tile that one workgroup sorts at once.

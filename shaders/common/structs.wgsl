@@ -13,6 +13,9 @@ struct View {
     center: vec4<f32>,
     center_low: vec4<f32>,
     background: vec4<f32>,
+    // A ray goes no farther when its transmittance is x or less; then y is behind it
+    // (crates/render/src/budget.rs).
+    ray_end: vec4<f32>,
     // Pixels.
     focal: vec2<f32>,
     principal: vec2<f32>,
@@ -71,6 +74,17 @@ struct View {
     ray_first: vec4<f32>,
     ray_across: vec4<f32>,
     ray_down: vec4<f32>,
+    // Inner normals of the planes through the camera beyond which nothing touches the picture; w:
+    // how far a scale of 1 moves them.
+    sides: array<vec4<f32>, 4>,
+    // A ball around the cameras of the photos; w is its radius.
+    photos: vec4<f32>,
+    // What a magnified view adds to a scale at most, for each unit of the distance from a photo.
+    photos_widen: f32,
+    // Blocks of the scene; 0: every Gaussian is projected.
+    block_count: u32,
+    // Not used: a row has a multiple of four.
+    rest: vec2<u32>,
 }
 
 // A photo that Gaussians were seen in.
@@ -83,6 +97,18 @@ struct Source {
     axis: vec3<f32>,
     // Not 0: its Gaussians are behind all of the others.
     behind: u32,
+}
+
+// Gaussians that are close together.
+struct Block {
+    // Middle of the box of their centres.
+    center: vec3<f32>,
+    // Largest scale.
+    reach: f32,
+    // Half the sides of the box.
+    half: vec3<f32>,
+    // Not used.
+    rest: u32,
 }
 
 struct Gaussian {
@@ -119,6 +145,8 @@ struct Plan {
     visible: atomic<u32>,
     // Bits of the largest depth, where depth is asked for in steps.
     farthest: atomic<u32>,
+    // Rows that cull has left.
+    rows: atomic<u32>,
 }
 
 // A step of training.
@@ -139,6 +167,6 @@ struct Training {
     // The photo, and its first pixel in `photos`.
     photo: u32,
     photo_start: u32,
-    // Not used: a uniform block has whole rows of four.
-    rest: u32,
+    // Whether pixels say how far they are from the photo, not what the loss is by them.
+    blames: u32,
 }

@@ -44,8 +44,8 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let near = options.near.unwrap_or_else(|| default_near(scene.meta.report.median_depth));
     let request = RenderRequest {
         antialiased: options.antialiased.unwrap_or(scene.meta.report.antialiased),
-        quality: options.quality,
-        ..RenderRequest::plain(first.camera, Kinds::ALL, near)
+        error: options.error.0,
+        ..RenderRequest::plain(first.camera, Kinds { depth: false, ..Kinds::ALL }, near)
     };
     let mut times = Vec::new();
     for _ in 0..args.frames {

@@ -28,18 +28,6 @@ pub fn parts(config: &Config) -> Result<(Parts, Arc<PipelineLoader>)> {
     Ok((Parts { scenes: networks, semantics, renderer, models }, engine))
 }
 
-/// What makes semantics; opens library and bundle only where `needed`.
-///
-/// # Errors
-/// `model_unavailable`.
-pub fn semantics(config: &Config, needed: bool) -> Result<Arc<dyn SemanticNetworks>> {
-    if !needed {
-        return Ok(Arc::new(NoSemantics));
-    }
-    let engine = Pipeline::open(&config.networks())?;
-    Ok(Arc::new(PipelineNetworks(Arc::new(engine.into()))))
-}
-
 /// The renderer that the configuration asks for.
 ///
 /// # Errors
@@ -54,7 +42,14 @@ pub fn renderer(config: &Config) -> Result<Arc<dyn Renderer>> {
 /// # Errors
 /// `model_unavailable`, `gpu_unavailable`.
 pub fn offline(config: &Config, texts: bool) -> Result<OfflineService> {
-    Ok(OfflineService::new(semantics(config, texts)?, renderer(config)?, config.limits.clone()))
+    let (mut networks, mut words): (Arc<dyn SemanticNetworks>, _) =
+        (Arc::new(NoSemantics), Vec::new());
+    if texts {
+        let engine = Pipeline::open(&config.networks())?;
+        words = engine.bundle().words()?;
+        networks = Arc::new(PipelineNetworks(Arc::new(engine.into())));
+    }
+    Ok(OfflineService::new(networks, renderer(config)?, &words, config.limits.clone()))
 }
 
 /// The description of a bundle for callers.

@@ -29,8 +29,8 @@ pub(super) struct Args {
     /// .glb …); with several texts, one file each
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Boxes of the parts: oriented, upright, aligned or none
-    #[arg(long, default_value = "oriented", value_parser = named::<Boxes>)]
+    /// Boxes of the parts: upright, oriented, aligned or none
+    #[arg(long, default_value = "upright", value_parser = named::<Boxes>)]
     boxes: Boxes,
     #[command(flatten)]
     camera: CameraFields,
@@ -130,14 +130,18 @@ fn describe(text: &mut String, found: &TextResult) {
             found.scores.len(),
         ),
     };
-    let _ = writeln!(text, "{:?}: {of}, best score {best:.2}", found.text);
+    let trust = match (&found.word, found.trust) {
+        (Some(word), Some(trust)) => format!("trust in {word:?}: {trust}"),
+        _ => "trust: no word that was measured".to_owned(),
+    };
+    let _ = writeln!(text, "{:?}: {of}, best score {best:.2}; {trust}", found.text);
     for part in &found.parts {
         let [x, y, z] = part.center;
         let [a, b, c] = part.size;
         let _ = writeln!(
             text,
-            "  part of {} at {x:.3}, {y:.3}, {z:.3}: {a:.3} x {b:.3} x {c:.3}",
-            part.gaussians
+            "  part of {} at {x:.3}, {y:.3}, {z:.3}: {a:.3} x {b:.3} x {c:.3}, score {:.2}",
+            part.gaussians, part.score
         );
     }
     if let Some(view) = &found.view {

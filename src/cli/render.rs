@@ -72,6 +72,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         "kind": view.kind,
         "format": view.format,
         "depth_scale": view.depth_scale,
+        "error": view.error,
         "camera": view.camera,
         "renderer": service.renderer().name(),
         "render_ms": view.times.render_ms,

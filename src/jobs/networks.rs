@@ -108,6 +108,8 @@ pub struct Phrases {
     pub coverage_floor: f32,
     /// Difference of cosines at which the relevancy is 0.5.
     pub margin: f32,
+    /// Share of the bundle's words that may fit an entry better than a text that selects it.
+    pub rivals: f32,
 }
 
 /// Makes the semantics of scenes, and embeds texts.
@@ -120,6 +122,15 @@ pub trait SemanticNetworks: Send + Sync {
     /// # Errors
     /// `model_unavailable`.
     fn phrases(&self) -> Result<Phrases>;
+
+    /// Embeddings of the everyday words that name things, by the bundle's list; none where it has
+    /// no list. On the calling thread.
+    ///
+    /// # Errors
+    /// `model_unavailable`, `internal`.
+    fn rivals(&self) -> Result<Arc<[Vec<f32>]>> {
+        Ok(Arc::default())
+    }
 
     /// Embeds texts, one after the other in their order. On the calling thread.
     ///
@@ -247,11 +258,16 @@ impl SemanticNetworks for PipelineNetworks {
             tau: manifest.tau,
             coverage_floor: manifest.coverage_floor,
             margin: manifest.margin,
+            rivals: manifest.rivals,
         })
     }
 
     fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
         self.0.get()?.image_text()?.embed_texts(texts)
+    }
+
+    fn rivals(&self) -> Result<Arc<[Vec<f32>]>> {
+        self.0.get()?.image_text()?.rivals()
     }
 
     fn begin_early(&self, method: &Method) -> bool {

@@ -114,6 +114,7 @@ pub(crate) fn refine_options(ms: u64, limits: &Limits) -> RefineOptions {
     RefineOptions {
         budget: RefineBudget { steps: limits.refine_steps_max, time },
         gaussians_max: limits.refine_gaussians_max,
+        side: limits.refine_side_max,
         device_bytes_max: limits.refine_device_bytes_max,
         ..RefineOptions::default()
     }

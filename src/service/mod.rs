@@ -28,6 +28,7 @@ mod texts;
 mod times;
 mod types;
 mod view;
+mod words;
 mod work;
 
 pub(crate) use self::refine::check_refine;
@@ -52,7 +53,10 @@ pub use self::{
     },
 };
 pub use crate::formats::{rle::Rle, table::ExportFormat};
-pub use crate::render::{Quality, plan::default_near};
+pub use crate::render::{
+    budget::{ERROR_FAST, MaxError},
+    plan::default_near,
+};
 pub use crate::scene::{
     Density, Event, MaskLevel, Method, Preset, SceneCamera, SceneError, SceneOptions, SceneState,
     SceneStatus, SemanticsMode, SemanticsState, SemanticsStatus, Upload, UploadCameras, UploadFile,

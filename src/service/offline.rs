@@ -8,7 +8,7 @@ use super::{
     search::{Backend, SceneTexts, ScoringChoice, SemanticScene},
     texts,
     times::ViewTimes,
-    types::{Picked, QueryAnswer, RenderedView},
+    types::{KnownWord, Picked, QueryAnswer, RenderedView},
     view::resolve_one,
     work::Work,
 };
@@ -33,13 +33,14 @@ impl std::fmt::Debug for OfflineService {
 }
 
 impl OfflineService {
-    /// A service with these networks, this renderer and these limits.
+    /// A service with these networks, this renderer, what was measured of words, and these limits.
     pub fn new(
         semantics: Arc<dyn SemanticNetworks>,
         renderer: Arc<dyn Renderer>,
+        words: &[KnownWord],
         limits: Limits,
     ) -> Self {
-        Self { backend: Arc::new(Backend::new(renderer, semantics, &limits)), limits }
+        Self { backend: Arc::new(Backend::new(renderer, semantics, words, &limits)), limits }
     }
 
     /// What draws the views.

@@ -25,7 +25,7 @@ use crate::{
     formats::rle::Rle,
     limits::Limits,
     scene::SceneId,
-    semantics::{Instance, InstanceOptions, Scorer},
+    semantics::{Box3, Instance, InstanceOptions, Scorer},
 };
 
 /// What each set of entries selects.
@@ -34,7 +34,27 @@ type Selections = HashMap<Vec<u16>, Selection>;
 /// A set of entries, what it selects, and in which parts.
 struct Selection {
     gaussians: u64,
-    parts: Vec<InstanceBox>,
+    parts: Vec<(Instance, Box3)>,
+}
+
+impl Selection {
+    /// The parts as a text finds them, the best first.
+    fn scored(&self, text: &ScoredText) -> Vec<InstanceBox> {
+        let part = |(of, held): &(Instance, Box3)| InstanceBox {
+            gaussians: of.gaussians.len() as u64,
+            score: of.score(text.scores.relevancies()),
+            center: held.center,
+            axes: held.axes,
+            size: held.size,
+            centroid: of.centroid,
+            covariance: of.covariance,
+            visibility: of.visibility.clone(),
+        };
+        let mut parts: Vec<InstanceBox> = self.parts.iter().map(part).collect();
+        // Of one score the largest stays first.
+        parts.sort_by(|a, b| b.score.total_cmp(&a.score));
+        parts
+    }
 }
 
 /// Answers the texts; `view` is that of the camera, where one was given.
@@ -70,7 +90,9 @@ pub(super) fn answer(
             scores: text.scores.relevancies().iter().skip(1).copied().collect(),
             found: selection.is_some_and(|selection| selection.gaussians > 0),
             gaussians: selection.map_or(0, |selection| selection.gaussians),
-            parts: selection.map_or_else(Vec::new, |selection| selection.parts.clone()),
+            parts: selection.map_or_else(Vec::new, |selection| selection.scored(text)),
+            word: text.known.as_ref().map(|known| known.word.clone()),
+            trust: text.known.as_ref().map(|known| known.trust),
             entries,
             warnings: text.warnings.clone(),
             view: view.transpose()?,
@@ -127,18 +149,10 @@ fn selections(
     let boxed = |instance: Instance| {
         let held = match boxes {
             Boxes::Aligned => instance.aligned(),
-            Boxes::Upright => instance.upright(),
-            Boxes::Oriented | Boxes::None => instance.oriented(),
+            Boxes::Oriented => instance.oriented(),
+            Boxes::Upright | Boxes::None => instance.upright(),
         };
-        InstanceBox {
-            gaussians: instance.gaussians.len() as u64,
-            center: held.center,
-            axes: held.axes,
-            size: held.size,
-            centroid: instance.centroid,
-            covariance: instance.covariance,
-            visibility: instance.visibility,
-        }
+        (instance, held)
     };
     let selection = |set: Vec<u16>| {
         work.unless_stopped()?;
@@ -265,7 +279,7 @@ mod tests {
 
         fn phrases(&self) -> Result<Phrases> {
             let canon = vec!["thing".to_owned()];
-            Ok(Phrases { canon, tau: 10.0, coverage_floor: 0.0, margin: 0.0 })
+            Ok(Phrases { canon, tau: 10.0, coverage_floor: 0.0, margin: 0.0, rivals: 1.0 })
         }
 
         fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
@@ -311,7 +325,7 @@ mod tests {
         let semantics = Semantics { bank, index: vec![1], ..Semantics::default() };
         let scene = Arc::new(scene.with_semantics(Arc::new(semantics)).unwrap());
         let limits = Limits::default();
-        let backend = Arc::new(Backend::new(Arc::new(Blank), Arc::new(Blank), &limits));
+        let backend = Arc::new(Backend::new(Arc::new(Blank), Arc::new(Blank), &[], &limits));
         let pose = PoseSpec::CameraToWorld(DMat4::IDENTITY.to_cols_array());
         let camera = Some(CameraSpec { pose, lens: LensSpec::default() });
         let spec = QuerySpec { camera, ..QuerySpec::default() };

@@ -10,7 +10,7 @@ use utoipa::{IntoParams, ToSchema};
 use crate::{
     error::{Error, Result},
     names::{display_names, named},
-    render::Quality,
+    render::budget::MaxError,
     scene::{Preset, Region, SceneOptions, ScoringMethod, Upload},
 };
 
@@ -114,9 +114,9 @@ impl Format {
 #[serde(rename_all = "snake_case")]
 pub enum Boxes {
     /// Turned along the part's own axes.
-    #[default]
     Oriented,
-    /// The same with the last axis up, as the photos tell it.
+    /// Turned about the upright alone, as the photos tell it: the last axis is up.
+    #[default]
     Upright,
     /// Along the axes of the world.
     Aligned,
@@ -334,10 +334,14 @@ pub struct ViewOptions {
     /// Near plane, world units. By default 0.01 of the scene's median depth.
     #[arg(long)]
     pub near: Option<f32>,
-    /// `exact` (default), or `fast` within a stated error.
-    #[arg(long, default_value = "exact", value_parser = named::<Quality>)]
-    #[param(inline)]
-    pub quality: Quality,
+    /// Largest difference to the exact picture, levels of 255, that is accepted for less time: 0 to
+    /// 32, `exact` (0, default) or `fast` (2). Views with depth are exact. Its old name is
+    /// `quality`.
+    #[arg(long, alias = "quality", default_value = "exact", value_name = "LEVELS")]
+    #[serde(alias = "quality")]
+    #[param(value_type = String)]
+    #[schema(value_type = serde_json::Value)]
+    pub error: MaxError,
     /// How it is drawn and texts are scored: `default` or `paper`. By default as the scene was
     /// made.
     #[arg(long, value_parser = named::<Preset>)]
@@ -386,6 +390,10 @@ pub struct ScoringOptions {
     /// Difference of cosines to the canonical texts at which the relevancy is 0.5, -2 to 2.
     #[arg(long)]
     pub margin: Option<f64>,
+    /// Share of the bundle's list of words that may fit an entry better than the text, 0 to 1; 1:
+    /// the list does not count.
+    #[arg(long)]
+    pub rivals: Option<f64>,
 }
 
 impl ScoringOptions {
@@ -399,6 +407,7 @@ impl ScoringOptions {
             coverage_floor: self.coverage_floor.unwrap_or(of.coverage_floor),
             near_best: self.near_best.unwrap_or(of.near_best),
             margin: self.margin.unwrap_or(of.margin),
+            rivals: self.rivals.unwrap_or(of.rivals),
         }
     }
 }

@@ -13,7 +13,8 @@ use super::{
     request::ScoringOptions,
     tags::{semantics_tag, text_key},
     times::{ViewTimes, staged},
-    types::TextWarning,
+    types::{KnownWord, TextWarning},
+    words::KnownWords,
 };
 use crate::{
     cache::Cache,
@@ -39,6 +40,7 @@ pub(super) struct ScoringChoice {
 pub(super) struct Backend {
     pub(super) renderer: Arc<dyn Renderer>,
     networks: Arc<dyn SemanticNetworks>,
+    words: KnownWords,
     /// By text; each weighs 1.
     embeddings: Cache<String, Arc<TextEmbedding>>,
     /// By scene, semantics and the choice of scoring, with what the choice came to; by bytes.
@@ -53,11 +55,13 @@ impl Backend {
     pub(super) fn new(
         renderer: Arc<dyn Renderer>,
         networks: Arc<dyn SemanticNetworks>,
+        words: &[KnownWord],
         limits: &Limits,
     ) -> Self {
         Self {
             renderer,
             networks,
+            words: KnownWords::new(words),
             embeddings: Cache::new(limits.texts_cached_max as u64),
             scorers: Cache::new(limits.scorers_cache_bytes_max),
             components: Cache::new(limits.pieces_cache_bytes_max),
@@ -92,9 +96,10 @@ impl Backend {
 
     /// How texts are scored by a preset with some changes.
     fn scoring(&self, preset: Preset, changes: &ScoringOptions) -> Result<ScoringMethod> {
-        let Phrases { canon, tau, coverage_floor, margin } = self.networks.phrases()?;
-        let [tau, floor, margin] = [tau, coverage_floor, margin].map(f64::from);
-        let method = changes.change(ScoringMethod::of(preset, canon, tau, floor, margin));
+        let Phrases { canon, tau, coverage_floor, margin, rivals } = self.networks.phrases()?;
+        let [tau, floor, margin, rivals] = [tau, coverage_floor, margin, rivals].map(f64::from);
+        let of_preset = ScoringMethod::of(preset, canon, tau, floor, margin, rivals);
+        let method = changes.change(of_preset);
         method.check()?;
         Ok(method)
     }
@@ -113,7 +118,9 @@ impl Backend {
         let method = self.scoring(preset, changes)?;
         let canon = self.embedded(&method.canon)?;
         let canon = canon.iter().map(|embedding| embedding.row.clone()).collect();
-        let scoring = Arc::new(Scoring::new(&method, canon)?);
+        let listed = method.rivals < 1.0;
+        let words = if listed { self.networks.rivals()? } else { Arc::default() };
+        let scoring = Arc::new(Scoring::new(&method, canon, words)?);
         let bank = &of.semantics.bank;
         let made = (method, Arc::new(Scorer::new(bank, scoring)?));
         let rows = bank.len() as u64;
@@ -124,11 +131,12 @@ impl Backend {
     }
 }
 
-/// A text, how the bank scores it, and what makes that doubtful.
+/// A text, how the bank scores it, what is known of its word, and what makes that doubtful.
 #[derive(Clone, Debug)]
 pub(super) struct ScoredText {
     pub(super) text: String,
     pub(super) scores: TextScores,
+    pub(super) known: Option<KnownWord>,
     pub(super) warnings: Vec<TextWarning>,
 }
 
@@ -240,6 +248,7 @@ impl SceneTexts {
                 Ok(ScoredText {
                     text: text.clone(),
                     scores: if silent { scores.silent() } else { scores },
+                    known: backend.words.of(text).cloned(),
                     warnings: warnings(text, &embedding),
                 })
             };

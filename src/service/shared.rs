@@ -141,12 +141,14 @@ impl Service {
             server_version: env!("CARGO_PKG_VERSION").to_owned(),
             ..parts.models
         };
+        let (renderer, semantics) = (parts.renderer, parts.semantics);
+        let backend = Backend::new(renderer, semantics, &models.words, &config.limits);
         let inner = Shared {
             store,
             jobs,
             networks,
             scheduler,
-            backend: Arc::new(Backend::new(parts.renderer, parts.semantics, &config.limits)),
+            backend: Arc::new(backend),
             models,
             reading: Arc::new(Semaphore::new(UPLOADS_READ_MAX)),
             folders: Arc::new(Semaphore::new(config.limits.folder_exports_max)),

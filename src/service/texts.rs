@@ -85,7 +85,7 @@ pub(super) fn all_checked(texts: &[String], what: &str, limits: &Limits) -> Resu
 /// other texts.
 pub(super) fn check_scoring(changes: &ScoringOptions, limits: &Limits) -> Result<()> {
     let canon = ScoringMethod::CANON.map(str::to_owned).to_vec();
-    changes.change(ScoringMethod::of(Preset::Paper, canon, 1.0, 0.0, 0.0)).check()?;
+    changes.change(ScoringMethod::of(Preset::Paper, canon, 1.0, 0.0, 0.0, 1.0)).check()?;
     if changes.canon.is_empty() {
         Ok(())
     } else {

@@ -17,6 +17,7 @@ use crate::{
     error::Result,
     formats::rle::Rle,
     limits::Limits,
+    names::display_names,
     render::FrameStats,
     scene::{Camera, SceneStatus, ScoringMethod},
 };
@@ -73,8 +74,12 @@ pub struct TextResult {
     pub found: bool,
     /// Gaussians selected.
     pub gaussians: u64,
-    /// Connected parts of the selection, the largest first.
+    /// Connected parts of the selection, the one with the best score first.
     pub parts: Vec<InstanceBox>,
+    /// The measured word that the text is about: one of `/v1/models`; none where there is none.
+    pub word: Option<String>,
+    /// What to expect of that word.
+    pub trust: Option<Trust>,
     /// What makes the answer doubtful.
     pub warnings: Vec<TextWarning>,
     /// What it found in the view.
@@ -97,12 +102,14 @@ pub struct TextWarning {
 pub struct InstanceBox {
     /// Gaussians.
     pub gaussians: u64,
+    /// Relevancy of its best entry, 0..1; of those that a tenth of its Gaussians have.
+    pub score: f32,
     /// Centre of the box.
     pub center: [f64; 3],
     /// Unit axes of the box, one a row, right-handed.
     pub axes: [[f64; 3]; 3],
-    /// Full lengths along the axes, world units. Of the centres of its Gaussians, half a per cent
-    /// on each side left out.
+    /// Full lengths along the axes, world units. The few Gaussians far from most of them are left
+    /// out.
     pub size: [f64; 3],
     /// Mean centre of its Gaussians, world units.
     pub centroid: [f64; 3],
@@ -197,6 +204,8 @@ pub struct RenderedView {
     pub bytes: Vec<u8>,
     /// World units of one step of a 16-bit depth PNG: depth = value * `depth_scale`.
     pub depth_scale: Option<f64>,
+    /// Bound of its difference to the exact picture, levels of 255; 0: it is exact.
+    pub error: f32,
     /// Camera it was rendered with.
     pub camera: Camera,
     /// Hash of scene and request; equal tags mean equal bytes.
@@ -396,6 +405,8 @@ pub enum Trust {
     /// Too few photographs show it.
     Unmeasured,
 }
+
+display_names!(Trust);
 
 /// What `/readyz` says.
 #[derive(Clone, Debug, PartialEq, Serialize, ToSchema)]

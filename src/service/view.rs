@@ -32,6 +32,7 @@ use crate::{
     names::shown,
     render::{
         self, Frame, Kinds, Labels, RenderRequest, Samples,
+        budget::{bound, check_error},
         plan::{self, NEAR_RANGE, ViewMethod, default_near},
     },
     scene::{Camera, Intrinsics, Method, Preset, Scene, SceneCamera, SceneId},
@@ -110,7 +111,7 @@ impl Resolved {
             },
             antialiased: self.options.antialiased.unwrap_or(scene.meta.report.antialiased),
             near: self.near,
-            quality: self.options.quality,
+            error: self.options.error.0,
         }
     }
 
@@ -223,6 +224,7 @@ impl Resolved {
                 height,
                 bytes: encoded.bytes,
                 depth_scale: encoded.depth_scale,
+                error: bound(self.options.error.0, self.kinds()),
                 camera: self.seen(),
                 etag: self.etag(&scene_tag(scene), &name, kind, &text)?,
                 stats: frame.stats,
@@ -342,6 +344,7 @@ fn resolve<'a>(
         }
         None => default_near(inputs.median_depth),
     };
+    check_error(options.error.0)?;
     let (method, preset) = inputs.draw_method(options)?;
     let resolved = |(camera_index, spec)| {
         let what = match cameras.len() {

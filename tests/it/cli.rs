@@ -218,7 +218,8 @@ fn errors_name_what_is_wrong_and_exit_by_the_table() {
     render(&["--camera", "0", "--width", "0"], ErrorCode::InvalidRequest, "width is 0 px");
     render(&["--camera", "0", "--width", "100000"], ErrorCode::LimitExceeded, "over 4096 px");
     render(&["--eye", "0,0", "--target", "0,0,1"], ErrorCode::InvalidRequest, "2 numbers, not 3");
-    render(&["--from", "0", "--quality", "best"], ErrorCode::InvalidRequest, "--quality");
+    render(&["--from", "0", "--quality", "best"], ErrorCode::InvalidRequest, "exact or fast");
+    render(&["--from", "0", "--error", "40"], ErrorCode::InvalidRequest, "error is 40; it must be");
     render(&["--from", "7"], ErrorCode::InvalidRequest, "from is 7");
     render(&["--eye", "0,0,-1", "--target", "0,0,-1"], ErrorCode::InvalidRequest, "same point");
     let line = ["render", text(&good), "--camera", "0", "-o", text(&good), "--renderer", "cpu"];

@@ -1,4 +1,4 @@
-//! A view's crop and quality at both doors.
+//! A view's crop and the error that it accepts at both doors.
 
 use crate::common::{
     cpu_server::{CpuServer, upload},
@@ -13,7 +13,7 @@ fn npy(file: &[u8]) -> Vec<f32> {
 }
 
 #[tokio::test]
-async fn both_doors_give_a_part_and_take_a_quality() {
+async fn both_doors_give_a_part_and_take_an_error() {
     let stand = CpuServer::start().await;
     for door in both(stand.addr).await {
         let (id, _) = door.create(&upload(), &Options::wait()).await.expect("a scene");
@@ -35,15 +35,29 @@ async fn both_doors_give_a_part_and_take_a_quality() {
             assert_eq!(fault.code, "invalid_request", "{case} by {name}: {}", fault.message);
             assert!(fault.message.contains(word), "{case} by {name}: {}", fault.message);
         }
-        let fast = npy(&door.view(&id, &ask.with("quality", "fast")).await.expect("a fast view"));
-        for (fast, exact) in fast.iter().zip(&whole) {
-            assert!((fast - exact).abs() < 0.05 * exact.max(1.0), "{name}: {fast}, not {exact}");
+        let colors = Ask::first().with("format", "npy");
+        let exact = npy(&door.view(&id, &colors).await.expect("an exact view"));
+        let asked = [("error", "8"), ("error", "0.5"), ("quality", "fast"), ("quality", "exact")];
+        for ((option, value), levels) in asked.into_iter().zip([8.0, 0.5, 2.0, 0.0]) {
+            let what = format!("{option}={value} by {name}");
+            let (file, told) =
+                door.bounded(&id, &colors.clone().with(option, value)).await.expect(&what);
+            assert_eq!(told, levels, "{what}: the bound that is told");
+            for (got, want) in npy(&file).iter().zip(&exact) {
+                assert!((got - want).abs() <= levels / 255.0 + 1e-5, "{what}: {got}, not {want}");
+            }
         }
+        let (file, told) = door.bounded(&id, &ask.clone().with("error", "8")).await.expect("depth");
+        assert_eq!((told, npy(&file)), (0.0, whole), "depth is exact by {name}");
+        let fault = door.view(&id, &ask.with("error", "33")).await.expect_err("33 levels");
+        assert_eq!(fault.code, "invalid_request", "33 by {name}");
+        let told = "error is 33; it must be 0 to 32 levels of 255, exact (0) or fast (2)";
+        assert_eq!(fault.message, told, "33 by {name}");
     }
     for (query, word) in [
         ("from=0&crop=1,2,3", "3 numbers"),
         ("from=0&crop=1,2,3,-4", "-4"),
-        ("from=0&quality=best", "exact or fast"),
+        ("from=0&error=best", "a number of levels, exact or fast"),
     ] {
         let url = stand.url(&format!("/v1/scenes/{}/view?{query}", "0".repeat(32)));
         let answer = crate::common::client().get(url).send().await.expect("an answer");

@@ -76,6 +76,7 @@ const NOT_ON_THE_PAGE: Absent = &[
     ("pick.*", "the pose and lens of the page's own view"),
     ("*.canon", "scored as the scene was made; the cut alone is the page's"),
     ("*.near_best", "scored as the scene was made; the cut alone is the page's"),
+    ("*.rivals", "scored as the scene was made; the cut alone is the page's"),
     ("*.unit_rows", "scored as the scene was made; the cut alone is the page's"),
     ("Scene.refinement", "it shows the version that is served when it is opened"),
     ("Scene.updated_ms", "it shows when a scene was made"),

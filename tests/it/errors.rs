@@ -292,10 +292,10 @@ async fn the_document_has_the_bodies_and_the_bounds_that_the_server_takes() {
     let schemas = &document["components"]["schemas"];
     let mut faults = Vec::new();
     let common = json!({
-        "width": 8, "height": 8, "antialiased": true, "near": 0.1, "quality": "fast",
+        "width": 8, "height": 8, "antialiased": true, "near": 0.1, "error": 0.5,
         "preset": "paper", "front_photos": 0, "magnify": true, "canon": ["thing"], "tau": 1.0,
         "cut": 0.2, "unit_rows": true, "coverage_floor": 0.1, "near_best": 0.3,
-        "margin": 0.01,
+        "margin": 0.01, "rivals": 0.5,
         "wait_ms": 0,
     });
     let [mut query, mut views] = [common.clone(), common];

@@ -21,14 +21,21 @@ async fn messages_name_the_field_the_value_and_what_it_must_be() {
             "view?from=0&width=4294967296",
             "width is \"4294967296\"; it must be a whole number".to_owned(),
         ),
-        ("view?from=0&quality=best", "quality is \"best\"; it must be exact or fast".to_owned()),
+        (
+            "view?from=0&error=best",
+            "error is \"best\"; it must be a number of levels, exact or fast".to_owned(),
+        ),
+        (
+            "view?from=0&quality=best",
+            "quality is \"best\"; it must be a number of levels, exact or fast".to_owned(),
+        ),
         ("view?eye=1,2", format!("eye has 2 numbers; {numbers}")),
         ("view?up=0,%201,x", "up is \"x\"; it must be a number".to_owned()),
         ("view?from=0&from=1", "from is given twice".to_owned()),
         (
             "export?limti=1",
             "unknown parameter \"limti\"; this call takes format, preset, canon, tau, cut, \
-             unit_rows, coverage_floor, near_best, margin, text, wait_ms"
+             unit_rows, coverage_floor, near_best, margin, rivals, text, wait_ms"
                 .to_owned(),
         ),
         // Without a text too.

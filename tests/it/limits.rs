@@ -63,7 +63,7 @@ enum Ask {
 }
 
 /// Limits, a value of each that changes the answer, and what is asked.
-const LIVE: [(&str, u64, Ask); 34] = [
+const LIVE: [(&str, u64, Ask); 35] = [
     ("photos_max", 2, Ask::Photos),
     ("photos_min", 4, Ask::Photos),
     ("upload_bytes_max", 1_000, Ask::Photos),
@@ -98,6 +98,7 @@ const LIVE: [(&str, u64, Ask); 34] = [
     ("refine_ms_max", 10, Ask::Refine),
     ("refine_steps_max", 1, Ask::Refine),
     ("refine_gaussians_max", 50, Ask::Refine),
+    ("refine_side_max", 20, Ask::Refine),
 ];
 
 /// Live as well, and not seen by these calls: those of keys, in `access.rs`, and of answers that
@@ -231,7 +232,7 @@ impl Asked {
                 .await;
                 self.server.service.delete(&id).await.unwrap();
                 let report = done.report.and_then(|report| report.refinement);
-                let figures = report.map(|r| (r.steps, r.gaussians_before));
+                let figures = report.map(|r| (r.steps, r.gaussians_before, r.psnr_before));
                 format!("{status} {} {figures:?}", said["message"])
             }
         }

@@ -37,7 +37,7 @@ impl Renderer for Given {
 }
 
 fn service(frame: Frame) -> OfflineService {
-    OfflineService::new(Arc::new(NoSemantics), Arc::new(Given(frame)), Limits::default())
+    OfflineService::new(Arc::new(NoSemantics), Arc::new(Given(frame)), &[], Limits::default())
 }
 
 /// One Gaussian before two cameras.

@@ -246,7 +246,7 @@ fn views_and_texts_of_a_scene_of_the_paper_are_its_formulas() {
 
     let networks = Arc::new(PipelineNetworks(Arc::new(self::engine().unwrap().into())));
     let renderer = Arc::new(CpuRenderer::new(2).unwrap());
-    let service = OfflineService::new(networks, renderer, Config::default().limits);
+    let service = OfflineService::new(networks, renderer, &[], Config::default().limits);
     let focal =
         LensSpec::Focal { fx: lens.fx, fy: Some(lens.fy), cx: Some(lens.cx), cy: Some(lens.cy) };
     let camera = CameraSpec { pose: PoseSpec::CameraToWorld(pose.to_row_major()), lens: focal };

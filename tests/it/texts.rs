@@ -13,9 +13,9 @@ use segsplat::{
     limits::Limits,
     scene::{Method, Preset, SceneCamera, SceneId, SceneOptions, SemanticsMode, SemanticsState},
     service::{
-        Boxes, CreateScene, ExportFormat, FeatureKind, FeaturesSpec, Format, MaskFormat, PickSpec,
-        PictureKind, PictureOptions, QuerySpec, Rle, ScoringOptions, TextOptions, ViewOptions,
-        ViewSpec, ViewsSpec,
+        Boxes, CreateScene, ExportFormat, FeatureKind, FeaturesSpec, Format, KnownWord, MaskFormat,
+        PickSpec, PictureKind, PictureOptions, QuerySpec, Rle, ScoringOptions, TextOptions, Trust,
+        ViewOptions, ViewSpec, ViewsSpec,
     },
 };
 
@@ -608,4 +608,57 @@ async fn queries_say_where_their_time_went_over_both_doors() {
         let sum: f64 = times[..5].iter().map(|(_, ms)| ms).sum();
         assert!(sum > 0.0 && sum <= times[5].1 + 0.06, "{door}: {times:?}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_answer_says_what_is_known_of_its_word_and_how_its_parts_score_at_both_doors() {
+    let known = |word: &str, trust: Trust| KnownWord {
+        word: word.to_owned(),
+        trust,
+        things: 0,
+        things_found: None,
+        photographs: 0,
+        photographs_found: None,
+        absent: 0.0,
+    };
+    let words = vec![known("photo 1", Trust::Good), known("photo 7", Trust::Poor)];
+    let server = TestServer::with(|_, parts| {
+        parts.semantics = Arc::new(PhotoMeaning::default());
+        parts.models.words = words;
+    })
+    .await;
+    let id = server.scene().await.id;
+    let asked = ["photo 1", "Photo 7", "photo 0"];
+    let url = server.url(&format!("/v1/scenes/{id}/query"));
+    let call = crate::common::client().post(url).json(&serde_json::json!({ "texts": asked }));
+    let answer = json(call.send().await.unwrap()).await.unwrap();
+    let http = answer["results"].as_array().unwrap().iter().map(|found| {
+        let score = found["parts"][0]["score"].as_f64().map(|score| score as f32);
+        let [word, trust] = ["word", "trust"].map(|key| found[key].as_str().unwrap_or_default());
+        (word.to_owned(), trust.to_owned(), found["found"].as_bool().unwrap(), score)
+    });
+    let mut client = segsplat::api::grpc::pb::scene_service_client::SceneServiceClient::new(
+        crate::common::doors::channel(server.addr).await,
+    );
+    let query = segsplat::api::grpc::pb::QueryRequest {
+        scene_id: id.to_string(),
+        texts: texts(&asked),
+        ..Default::default()
+    };
+    let answer = client.query(query).await.unwrap().into_inner();
+    let grpc = answer.results.iter().map(|found| {
+        let score = found.parts.first().map(|part| part.score);
+        (found.word.clone(), found.trust.clone(), found.found, score)
+    });
+    let best = |result: usize| answer.results[result].scores.iter().copied().reduce(f32::max);
+    let want = |word: &str, trust: &str, found: bool, score: Option<f32>| {
+        (word.to_owned(), trust.to_owned(), found, score)
+    };
+    let want = [
+        want("photo 1", "good", true, best(0)),
+        want("photo 7", "poor", false, None),
+        want("", "", true, best(2)),
+    ];
+    assert_eq!(http.collect::<Vec<_>>(), want);
+    assert_eq!(grpc.collect::<Vec<_>>(), want);
 }

@@ -150,17 +150,8 @@ def test_a_word_says_how_well_it_fits_and_how_well_it_is_known(
     with urllib.request.urlopen(f"{url}/v1/scenes/{scene}/query", body) as answer:
         truth = json.load(answer)["results"][0]
     assert f"{max(truth['scores']):.2f}" in chips.nth(0).locator(".score").inner_text()
-    # The best part is first; each box is upright, and lies in the server's box of the part.
-    found = words[0]["parts"]
-    scores = [part["score"] for part in found]
-    assert len(found) == len(truth["parts"]) and scores == sorted(scores, reverse=True)
-    chosen = [truth["scores"][entry - 1] for entry in truth["entries"]]
-    assert min(chosen) - 1e-3 <= min(scores) and max(scores) <= max(chosen) + 1e-3, (scores, chosen)
-    largest = max(found, key=lambda part: part["gaussians"])
-    whole = next(p for p in truth["parts"] if p["gaussians"] == largest["gaussians"])
-    assert largest["axes"] == whole["axes"]
-    share = np.array(largest["size"]) / whole["size"]
-    assert (share <= 1).all() and (share > 0.2).all() and share.min() < 1, share
+    # The parts are those of the server, with upright boxes.
+    assert words[0]["parts"] == truth["parts"] != []
 
 
 def test_a_word_that_is_nowhere_is_not_found(page: Page, url: str, scene: str) -> None:

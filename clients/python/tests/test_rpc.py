@@ -33,7 +33,7 @@ def test_both_wires_tell_the_same(scene: Scene, url: str) -> None:
         assert np.array_equal(one.gaussians(text).means, other.gaussians(text).means)
     spot: Viewpoint = {"eye": [0, -1.6, -3.4], "target": [0, -0.6, 0], "fov": 50.0}
     for background in ("black", "#102030", [0.1, 0.2, 0.3]):
-        how: ViewOptions = {"width": 48, "crop": (8, 4, 16, 12), "quality": "fast"}
+        how: ViewOptions = {"width": 48, "crop": (8, 4, 16, 12), "error": "fast"}
         how["background"] = background
         views = [one_of.view(**spot, **how) for one_of in (one, other)]
         assert views[0].image.shape == (12, 16, 3)

@@ -99,6 +99,19 @@ def test_corners_are_those_of_the_box(scene: Scene) -> None:
     assert np.allclose(np.abs(aligned.axes), np.eye(3))
 
 
+def test_an_answer_says_what_is_known_of_its_word(scene: Scene) -> None:
+    box, nothing = scene.query("a photo of boxes", "zxqv", masks=False)
+    trust = {known.word: known.trust for known in scene.client.models().words}
+    assert (box.word, box.trust) == ("box", trust["box"])
+    assert (nothing.word, nothing.trust, nothing.found) == (None, None, False)
+    assert str(nothing) == "zxqv: not found (no word that was measured)"
+    parts = f"{len(box.boxes)} part{'s' if len(box.boxes) > 1 else ''}"
+    told = f"{box.gaussians:,} Gaussians in {parts}, score {box.score:.2f} ({box.trust})"
+    assert str(box) == f"a photo of boxes: {told}"
+    scores = [part.score for part in box.boxes]
+    assert scores == sorted(scores, reverse=True) and 0.5 <= scores[0] <= box.score + 1e-6
+
+
 def test_parts_say_where_how_wide_and_how_well_seen_they_are(scene: Scene) -> None:
     # The largest of what is taken for the floor.
     part, *_ = scene.query("floor", boxes="upright", masks=False).boxes

@@ -192,11 +192,14 @@ limits! {
     refine_ms_max: u64 = 600_000;
     /// Steps of one refinement: those of ten minutes on 64 cores.
     refine_steps_max: u32 = 20_000;
-    /// Gaussians that a refinement begins with; of more, as many are chosen and made wider.
-    refine_gaussians_max: usize = 150_000;
+    /// Gaussians that a refinement may end with. It begins with at most 150,000.
+    refine_gaussians_max: usize = 1_000_000;
+    /// Longer side at which a refinement on a GPU learns photos, pixels; on the processor it is at
+    /// most 640.
+    refine_side_max: u32 = 1_600;
     /// Bytes that a refinement may take on a GPU device; what needs more is refined on the
     /// processor.
-    refine_device_bytes_max: u64 = 1 << 30;
+    refine_device_bytes_max: u64 = 2 << 30;
     /// Milliseconds a caller may hold a request open with `wait_ms`.
     wait_ms_max: u64 = 600_000;
     /// Requests a second of one API key that says no number of its own; a second's worth at once.

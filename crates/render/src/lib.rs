@@ -12,6 +12,8 @@
 )]
 
 pub mod backward;
+pub mod blocks;
+pub mod budget;
 pub mod compare;
 pub mod constants;
 pub mod cpu;
@@ -34,8 +36,6 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 pub use segsplat_core::scene::PixelWeights;
-use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
 
 #[cfg(feature = "testing")]
 pub use self::switches::{Skip, Switches};
@@ -70,24 +70,6 @@ impl Kinds {
     /// No picture: labels alone.
     pub const NONE: Self = Self { color: false, depth: false, alpha: false };
 }
-
-/// How closely a renderer keeps to the model; `docs/conventions.md` bounds what `Fast` may differ.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum Quality {
-    /// f32 all through.
-    #[default]
-    Exact,
-    /// Faster where a renderer has a faster way, else the same.
-    Fast,
-}
-
-impl Quality {
-    /// All, the default first.
-    pub const ALL: [Self; 2] = [Self::Exact, Self::Fast];
-}
-
-segsplat_core::names::display_names!(Quality);
 
 /// What lies behind the Gaussians: a pixel is `colour + (1 - alpha) * background`.
 #[derive(Clone, Debug, PartialEq)]
@@ -165,8 +147,9 @@ pub struct RenderRequest {
     pub antialiased: bool,
     /// Near plane, world units along t.z.
     pub near: f32,
-    /// How closely to keep to the model.
-    pub quality: Quality,
+    /// Largest difference to the exact picture that is accepted, levels of 255: 0 to
+    /// [`budget::ERROR_MAX`]; 0 is exact. docs/conventions.md says what it means for each picture.
+    pub error: f32,
 }
 
 impl RenderRequest {
@@ -183,7 +166,7 @@ impl RenderRequest {
             samples: Samples::F32,
             antialiased: false,
             near,
-            quality: Quality::Exact,
+            error: 0.0,
         }
     }
 

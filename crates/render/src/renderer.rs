@@ -119,9 +119,10 @@ pub trait DifferentiableRenderer: Renderer {
         Ok(None)
     }
 
-    /// Whether it draws on a device whose clocks fall while nothing is drawn: one NVIDIA H200 is
-    /// two to six times as slow in the first half second after that.
-    fn slow_after_rest(&self) -> bool {
+    /// Whether it draws on a device: steps on large photos are quick there. And its clocks may fall
+    /// while nothing is drawn: one NVIDIA H200 is two to six times as slow in the first half second
+    /// after that.
+    fn is_device(&self) -> bool {
         false
     }
 }

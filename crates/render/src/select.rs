@@ -157,8 +157,8 @@ impl DifferentiableRenderer for WithCpu {
         self.gpu.trainer(set, bytes_max)
     }
 
-    fn slow_after_rest(&self) -> bool {
-        self.gpu.slow_after_rest()
+    fn is_device(&self) -> bool {
+        self.gpu.is_device()
     }
 }
 

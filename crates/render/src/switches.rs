@@ -44,6 +44,8 @@ switches! {
     /// Gaussian-tile pairs held at once; more are drawn in bands. `None`: as many as
     /// [`crate::constants::ISECTS_MAX`]. All renderers.
     isects_max: Option<u32>;
+    /// Gaussians from which a scene has blocks. `None`: [`crate::blocks::BLOCKS_MIN`]. All renderers.
+    blocks_min: Option<usize>;
     /// Lanes of the CPU kernels. `None`: the widest of the processor.
     width: Option<Width>;
     /// Takes the smallest limits of WebGPU instead of those of the adapter: 128 MiB a binding,
@@ -130,12 +132,14 @@ pub enum Skip {
     /// Directions to Gaussians, and on a GPU the stage that shades, of a scene whose colours are
     /// the same from everywhere.
     FlatColor,
+    /// Gaussians of blocks that are beside the picture or before the near plane.
+    Blocks,
 }
 
 impl Skip {
     /// All of them.
-    pub const ALL: [Self; 4] =
-        [Self::EllipseTiles, Self::EllipseParts, Self::EndedRays, Self::FlatColor];
+    pub const ALL: [Self; 5] =
+        [Self::EllipseTiles, Self::EllipseParts, Self::EndedRays, Self::FlatColor, Self::Blocks];
 
     /// Whether a renderer leaves it out that does `without` all the same.
     #[inline]

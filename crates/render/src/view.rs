@@ -5,6 +5,7 @@ use glam::{DMat3, DVec3};
 
 use super::{
     Background, RenderRequest,
+    budget::check_error,
     constants::{FRUSTUM_MARGIN, TILE_SIZE},
 };
 use crate::error::{Error, Result};
@@ -44,8 +45,8 @@ impl View {
     ///
     /// # Errors
     /// `invalid_request` when the intrinsics are unusable, the near plane is not a finite number
-    /// over 0, or background, sources or labels are not finite; `limit_exceeded` for a picture
-    /// beyond memory.
+    /// over 0, the error is out of range, or background, sources or labels are not finite;
+    /// `limit_exceeded` for a picture beyond memory.
     pub fn new(origin: DVec3, request: &RenderRequest) -> Result<Self> {
         let lens = request.camera.intrinsics.validated("camera")?;
         let cropped = match request.crop {
@@ -66,6 +67,7 @@ impl View {
         for (i, source) in request.sources.iter().enumerate() {
             source.check(i)?;
         }
+        check_error(request.error)?;
         request.labels.check()?;
         let pixels = u64::from(cropped.width) * u64::from(cropped.height);
         if pixels > PIXELS_MAX || cropped.width.max(cropped.height) > SIDE_MAX {

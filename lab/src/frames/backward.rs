@@ -116,7 +116,8 @@ fn trained(
     let rgb = (0..bytes).map(|_| random.range(0.0, 255.0) as u8).collect();
     let photo = Photo { width: lens.width, height: lens.height, rgb, valid: None };
     let photos = vec![TrainingPhoto { photo: &photo, request: request.clone() }];
-    let set = TrainingSet { gaussians, photos, ssim_share: RefineOptions::default().ssim_share };
+    let ssim_share = RefineOptions::default().ssim_share;
+    let set = TrainingSet { gaussians, photos, ssim_share, gaussians_max: 0 };
     let Some(mut trainer) = renderer.trainer(&set, u64::MAX)? else { return Ok(None) };
     let rates = LearningRates::default();
     let step = TrainingStep { rates, exposure: 5e-3, opacity_min: 0.0 };

@@ -4,7 +4,9 @@
 //! cameras a fifth of the depth apart, drawn from between them. Its Gaussians have bank entries in
 //! patches, as things do: `--labels` times labels beside colour.
 
+pub(crate) mod aims;
 pub(crate) mod backward;
+pub(crate) mod frontier;
 mod generated;
 pub(crate) mod skips;
 
@@ -19,7 +21,7 @@ use self::generated::{dump, scene};
 use crate::{
     error::{Error, Result},
     render::{
-        DeviceTimes, DispatchTime, Frame, Kinds, Labels, Quality, RenderRequest, Renderer, Samples,
+        DeviceTimes, DispatchTime, Frame, Kinds, Labels, RenderRequest, Renderer, Samples,
         Switches,
         compare::{Compared, compare, compare_oracle},
         cpu::CpuRenderer,
@@ -49,9 +51,6 @@ pub(crate) struct Args {
     /// Frames after the first
     #[arg(long, default_value_t = 50)]
     frames: usize,
-    /// How closely to keep to the model: exact or fast
-    #[arg(long, default_value = "exact", value_parser = segsplat_core::names::named::<Quality>)]
-    quality: Quality,
     /// What the picture is compared with
     #[arg(long, default_value = "oracle")]
     compare: Reference,
@@ -120,8 +119,7 @@ impl Args {
     /// The generated scene, and the view of it with every picture.
     fn scene(&self) -> Result<(Gaussians, RenderRequest)> {
         let (gaussians, camera) = scene(self.gaussians, self.bank, [self.width(), self.size])?;
-        let request = scenes::request(camera);
-        Ok((gaussians, RenderRequest { quality: self.quality, ..request }))
+        Ok((gaussians, scenes::request(camera)))
     }
 }
 
@@ -167,8 +165,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let of_picture = match args.compare {
         Reference::Cpu => {
             let cpu = CpuRenderer::new(args.setup.threads())?;
-            let exact = RenderRequest { quality: Quality::Exact, ..request.clone() };
-            let of_cpu = Drawing { renderer: &cpu, request: &exact, ..drawing };
+            let of_cpu = Drawing { renderer: &cpu, ..drawing };
             let want = of_cpu.frame()?;
             cpu_ms = Some(median(of_cpu.times(args.frames.min(CPU_FRAMES_MAX))?));
             compare(&frame, &want, &gaussians, &request)?
@@ -177,7 +174,6 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     };
     let row = json!({
         "renderer": renderer.name(),
-        "quality": args.quality,
         "adapters": adapters,
         "gaussians": gaussians.len(),
         "width": args.width(),
@@ -292,9 +288,8 @@ impl Drawing<'_> {
         }
         let [color_ms, labels_ms, both_ms] = runs.map(median);
         let frame = of(&alone).frame()?;
-        let exact = RenderRequest { quality: Quality::Exact, ..alone.clone() };
         let cpu = CpuRenderer::new(args.setup.threads())?;
-        let want = cpu.render(self.gaussians, &exact)?;
+        let want = cpu.render(self.gaussians, &alone)?;
         let times = json!({
             "labels": name,
             "bank": args.bank,

@@ -12,6 +12,7 @@ mod path;
 mod photos;
 mod scenes;
 mod server;
+mod start;
 mod tally;
 mod views;
 
@@ -26,6 +27,8 @@ pub(crate) enum Command {
     Views(views::Args),
     /// Scenes of two photos, and the mask of a text in each
     Scenes(scenes::Args),
+    /// Starts of a server, until it listens and until its networks are open
+    Start(start::Args),
 }
 
 /// Makes the rows of the command.
@@ -36,5 +39,6 @@ pub(crate) fn run(command: &Command, rows: &mut Rows) -> Result<()> {
     match command {
         Command::Views(args) => views::run(args, rows),
         Command::Scenes(args) => scenes::run(args, rows),
+        Command::Start(args) => start::run(args, rows),
     }
 }

@@ -22,9 +22,9 @@ use crate::{
 /// Longest wait for a scene, its semantics among it.
 const WAIT_MS: u64 = 300_000;
 
-/// Looks at whether a server's networks are open, a tenth of a second apart. On a device that takes
-/// a minute.
-const READY_LOOKS: u32 = 1_800;
+/// Looks at whether a server's networks are open, so far apart. A device takes half a minute.
+const READY_LOOKS: u32 = 18_000;
+const READY_EVERY: Duration = Duration::from_millis(10);
 
 /// A runtime with few threads: the cores belong to the server.
 pub(super) fn runtime(threads: Option<usize>) -> Result<tokio::runtime::Runtime> {
@@ -90,7 +90,19 @@ impl Servers {
         Ok(servers)
     }
 
-    fn run(&self, program: &str, setup: &Setup) -> Result<Server> {
+    /// The programs to start.
+    ///
+    /// # Errors
+    /// `invalid_request` where there is none.
+    pub(super) fn programs(&self) -> Result<&[String]> {
+        match self.programs.is_empty() {
+            true => Err(Error::invalid("--server must name a program to start")),
+            false => Ok(&self.programs),
+        }
+    }
+
+    /// Starts a program; it listens when this returns.
+    pub(super) fn run(&self, program: &str, setup: &Setup) -> Result<Server> {
         let (name, path) = match program.split_once('=') {
             Some((name, path)) => (name.to_owned(), PathBuf::from(path)),
             None => ("segsplat".to_owned(), PathBuf::from(program)),
@@ -120,7 +132,8 @@ impl Servers {
 }
 
 impl Server {
-    async fn wait_until_ready(&mut self) -> Result<()> {
+    /// Waits until its networks are open.
+    pub(super) async fn wait_until_ready(&mut self) -> Result<()> {
         let connection = Connection::http(&self.address, Door::Http1)?;
         for _ in 0..READY_LOOKS {
             let state = json(connection.get("/readyz")?).await;
@@ -129,7 +142,7 @@ impl Server {
                 models["renderer"].as_str().unwrap_or("?").clone_into(&mut self.renderer);
                 return Ok(());
             }
-            tokio::time::sleep(Duration::from_millis(100)).await;
+            tokio::time::sleep(READY_EVERY).await;
         }
         Err(Error::invalid(format!("server {:?} did not get ready in three minutes", self.name)))
     }

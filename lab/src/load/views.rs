@@ -75,7 +75,7 @@ pub(crate) struct Args {
     /// Views of one call: over 1 by `POST /v1/scenes/{id}/views`, or `RenderViews` of gRPC
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=64))]
     together: u64,
-    /// More parameters of each view over HTTP: `&quality=fast`
+    /// More parameters of each view over HTTP: `&error=2`
     #[arg(long, default_value = "")]
     more: String,
     /// Most views of a row

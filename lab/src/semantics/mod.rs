@@ -6,6 +6,7 @@
 //! 3D: each mask of the nearest photo is scored by the same text, and the masks are laid over the
 //! target as they are.
 
+mod boxes;
 pub mod labels;
 pub mod pca;
 pub mod tally;
@@ -30,7 +31,7 @@ use crate::{
     render::cpu::CpuRenderer,
     rows::{Rows, progress},
     scene::{Preset, SceneOptions, with_pairs},
-    scenes::{inputs, means_by_use, use_of},
+    scenes::{inputs, means_by_use, spread, use_of},
     setup::Inputs,
 };
 
@@ -53,6 +54,9 @@ pub(crate) struct Args {
     /// Photos put in are spread over those that are no target; one scene is made for all targets
     #[arg(long, conflicts_with = "overlap")]
     spread: bool,
+    /// Judge the boxes of parts in space in place of masks, of scenes that `make eval-scenes` made
+    #[arg(long, conflicts_with = "overlap")]
+    boxes: bool,
     /// Words for what is in no scene, separated by commas
     #[arg(long, value_delimiter = ',', default_value = ABSENT)]
     absent: Vec<String>,
@@ -125,6 +129,10 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         progress(&format!("{scene}: mIoU {miou:.3}"));
         rows.push(json!({ "one_less_miou": 1.0 - miou }), row)
     };
+    if args.boxes {
+        let way = ways.first().ok_or_else(|| Error::invalid("--boxes needs a preset"))?;
+        return judge_boxes(&tools, way, args, rows);
+    }
     let (mut scenes, mut counted) = (Vec::new(), Vec::new());
     for (name, dir) in args.inputs.find(labels::is_labelled)? {
         let scene = labels::read(&dir, &Limits::default())?;
@@ -142,6 +150,26 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         push(row)?;
     }
     Ok(())
+}
+
+/// Makes a row for the boxes of each scene, and one of means; the error is one less the IoU.
+fn judge_boxes(tools: &Tools<'_>, way: &Way, args: &Args, rows: &mut Rows) -> Result<()> {
+    let mut push = |row: Value| {
+        let iou = row["upright_iou"].as_f64().unwrap_or(f64::NAN);
+        progress(&format!("{}: IoU of upright boxes {iou:.3}", row["scene"]));
+        rows.push(json!({ "one_less_iou": 1.0 - iou }), row)
+    };
+    let mut scenes = Vec::new();
+    for (name, dir) in args.inputs.find(labels::is_labelled)? {
+        let scene = labels::read(&dir, &Limits::default())?;
+        let mut row = boxes::judge(tools, way, &dir, &scene, args.inputs.photos)?;
+        row["scene"] = json!(name);
+        row["use"] = json!(use_of(&name));
+        row["photos"] = json!(args.inputs.photos);
+        push(row.clone())?;
+        scenes.push(row);
+    }
+    means_by_use(&scenes).into_iter().try_for_each(push)
 }
 
 /// Counts of the scene and of the flat baseline.
@@ -236,13 +264,6 @@ fn judge(
     let row =
         json!({ "scene": name, "use": use_of(name), "targets": targets, "left_out": left_out });
     Ok((row, tallies))
-}
-
-/// `count` of the photos that are not `asked`, evenly spread; all of them where there are no more.
-fn spread(photos: usize, asked: &[usize], count: usize) -> Vec<usize> {
-    let others: Vec<usize> = (0..photos).filter(|photo| !asked.contains(photo)).collect();
-    let count = count.min(others.len());
-    (0..count).map(|i| others[(2 * i + 1) * others.len() / (2 * count)]).collect()
 }
 
 /// One target's pictures: photo, view, E and F of the view, labels, then for each preset the best

@@ -41,8 +41,8 @@ pub(super) struct Way {
 pub(super) struct Made {
     given: Vec<PosedPhoto>,
     method: Method,
-    scene: Scene,
-    bank: Bank,
+    pub(super) scene: Scene,
+    pub(super) bank: Bank,
     meaning: SemanticsReport,
 }
 

@@ -6,9 +6,9 @@ The training of geometry saw 69 of these 74 meshes.
 
 Each scene is a folder in the layout of the shared scenes: `images/*.png`, `transforms.json`
 (OpenGL poses), `masks/*.png` (value = class, every pixel labelled) and `masks/classes.json`; beside
-them `instances/*.png` (value = object) and `scene.json` (which mesh is which object, where it is,
-and which classes are only surroundings: floor and walls are counted as wrong where a text selects
-them, and are not asked for). Odd scenes are a table top, even ones a room with furniture. The same
+them `instances/*.png` (value = object) and `scene.json` (which mesh is which object, where it is, its
+smallest upright box, and which classes are only surroundings: floor and walls are counted as wrong
+where a text selects them, and are not asked for). Odd scenes are a table top, even ones a room with furniture. The same
 seed gives the same bytes of every picture.
 """
 import argparse
@@ -200,7 +200,8 @@ class Maker:
                 meshes.append(rows_of(p.astype(np.float32), uv.astype(np.float32), rgb / 255.0, tex))
                 turned = p.astype(float).reshape(-1, 3) @ upright(entry).T
                 self.things.append({"file": entry["file"], "name": plain_name(entry), "mesh": len(meshes) - 1,
-                                    "up": upright(entry), "lo": turned.min(0), "hi": turned.max(0)})
+                                    "up": upright(entry), "lo": turned.min(0), "hi": turned.max(0),
+                                    "points": np.unique(p.astype(float).reshape(-1, 3), axis=0)})
         if len(self.things) != len(kept):
             raise SystemExit(f"{len(kept)} held-out meshes listed, {len(self.things)} found")
         images = [np.asarray(Image.open(io.BytesIO(v[1])).convert("RGB")) for v in sorted(textures.values())]
@@ -224,6 +225,23 @@ class Maker:
         corners = np.array([[x, y, z] for x in (thing["lo"][0], thing["hi"][0]) for y in (thing["lo"][1], thing["hi"][1])
                             for z in (thing["lo"][2], thing["hi"][2])]) * (size / 2) @ turn(yaw).T
         return corners.min(0), corners.max(0)
+
+
+def upright_box(points):
+    """The box of points that stands upright (y is down) and covers the least ground: the form of `parts` of a query."""
+    def bounds(degrees):
+        turned = points @ turn(degrees)
+        return turned.min(0), turned.max(0)
+
+    def ground(degrees):
+        lo, hi = bounds(degrees)
+        return (hi[0] - lo[0]) * (hi[2] - lo[2])
+
+    yaw = min(range(90), key=ground)
+    lo, hi = bounds(yaw)
+    across, along = turn(yaw)[:, 0], turn(yaw)[:, 2]
+    return {"center": (turn(yaw) @ ((lo + hi) / 2)).tolist(), "axes": [across.tolist(), along.tolist(), [0.0, -1.0, 0.0]],
+            "size": [hi[0] - lo[0], hi[2] - lo[2], hi[1] - lo[1]]}
 
 
 def sheet(maker, path, threads):
@@ -303,6 +321,7 @@ def compose(maker, number):
                 labels.append(name)
                 maker.used[name] = maker.used.get(name, 0) + 1
                 kept.append({"name": name, "file": thing["file"], "instance": len(insts) - 1, "centre": centre.tolist(),
+                             "box": upright_box(thing["points"] @ linear.T + centre),
                              "lower": [x - sx, ground - (hi[1] - lo[1]), z - sz], "upper": [x + sx, ground, z + sz]})
                 break
     warm, k = rng.uniform(0.9, 1.0, 3), rng.uniform(0.42, 0.52)

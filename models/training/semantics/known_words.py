@@ -3,7 +3,7 @@
     python known_words.py --bundle ../../embedded --data ../../../../shared/data --pack PACK [--page ../../../docs/words.md]
 
 Of each word of everyday.txt and known_words.txt, on photographs that no training saw: how many cut things and whole
-photographs show it, in what share of them it beats every canon phrase (*found*), and in what share of the others (*absent*).
+photographs show it, in what share of them the server would select it (*found*), and in what share of the others (*absent*).
 WordNet and everyday.txt say of what a word may be said; what may or may not be said counts for neither. Colours: the
 dominant colour under the mask says what is true.
 """
@@ -21,6 +21,7 @@ from pictures import decoded, letterbox
 from wordnet import WordNet
 from words_model import SIDE
 
+NO_THINGS = ("colours", "places")  # kinds whose words are no rivals of a text in the server
 FEWEST = 5  # things that a figure is trusted from
 GOOD, POOR = (0.7, 0.03), (0.4, 0.1)  # found at least, absent at most; found under, absent over
 
@@ -57,7 +58,7 @@ def main():
     bundle, everyday = Bundle(args.bundle), Everyday(WordNet(args.wordnet))
     groups = kinds()
     words = [w for v in groups.values() for w in v]
-    text, canon = bundle.texts(words), bundle.texts(bundle.manifest["canon"])
+    text = bundle.texts(words)
 
     # Things as the server sees them, and whole photographs in a black square.
     rows = collect(args.data, "choosing")
@@ -66,7 +67,8 @@ def main():
     whole = [letterbox(decoded(held["blob"], held["offsets"], i), SIDE) for i in at]
     labels = [r[2] for r in rows] + [str(packed["words"][packed["own"][c]]) for c in held["label"][at]]
     seen = np.concatenate([bundle.things(rows, bundle.manifest["image"].get("crop_margin", 0.0)), bundle.pictures(whole)])
-    beats = seen @ text.T >= (seen @ canon.T).max(1, keepdims=True) + bundle.manifest.get("margin", 0.0)
+    named = [j for j, w in enumerate(words) if not any(w in groups[k] for k in NO_THINGS)]
+    beats = seen @ text.T >= bundle.floor(seen, text[named])[:, None]
     thing = np.arange(len(labels)) < len(rows)
 
     # 1 true, 0 false, -1 open.
@@ -95,7 +97,7 @@ def main():
         shows, lacks = truth[:, j] == 1, truth[:, j] == 0
         row = {"word": word, "things": int((shows & thing).sum()), "things_found": share(beats[shows & thing, j]),
                "photographs": int((shows & ~thing).sum()), "photographs_found": share(beats[shows & ~thing, j]), "absent": share(beats[lacks, j]) or 0.0}
-        out.append({**row, "trust": judged(row)})
+        out.append({**row, "trust": judged(row), **({} if j in named else {"rival": False})})
     with open(os.path.join(args.bundle, "words.json"), "w") as f:
         f.write("[\n" + ",\n".join(json.dumps(r) for r in out) + "\n]\n")
     count = {t: sum(r["trust"] == t for r in out) for t in ("good", "fair", "poor", "unmeasured")}
@@ -110,7 +112,7 @@ def page(path, groups, count, things, photographs):
     lines = [
         "# Words that the embedded bundle knows", "",
         f"Measured on {things} things that were cut out along their labelled outlines and {photographs} whole photographs; no training saw them.",
-        "*Found*: of those that show it, the share for which the word beats every canon phrase. *Absent*: of those that do not show it,",
+        "*Found*: of those that show it, the share for which the server would select it. *Absent*: of those that do not show it,",
         f"the share for which it does so, too. *Good*: found in at least {GOOD[0]:.0%}, absent in at most {GOOD[1]:.0%}. *Poor*: found in under",
         f"{POOR[0]:.0%}, or absent in over {POOR[1]:.0%}. *Unmeasured*: fewer than {FEWEST} things and photographs show it. By things where there",
         "are enough, else by photographs. The server says the same in `GET /v1/models`, field `words`.", "",

@@ -69,6 +69,7 @@ class Bundle:
     """The two towers of a bundle's folder, on the CPU."""
 
     def __init__(self, folder, threads=1, image=None):
+        self.folder = folder
         self.manifest = tomllib.load(open(os.path.join(folder, "bundle.toml"), "rb"))["image_text"]
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads
@@ -91,6 +92,16 @@ class Bundle:
             x = np.stack([np.asarray(Image.fromarray(s).resize((side, side), Image.BILINEAR), np.float32) / 255 for s in squares[at : at + 16]])
             rows.append(self.image.run(None, {"images": ((x - mean) / std).transpose(0, 3, 1, 2).astype(np.float32)})[0])
         return np.concatenate(rows)
+
+    def floor(self, seen, words=None):
+        """The score that a text must reach for each row: that of the canon with the margin, and that of the last rival of the bundle's list."""
+        floor = (seen @ self.texts(self.manifest["canon"]).T).max(1) + self.manifest.get("margin", 0.0)
+        share = self.manifest.get("rivals", 1.0)
+        if share >= 1.0:
+            return floor
+        if words is None:
+            words = self.texts([r["word"] for r in json.load(open(os.path.join(self.folder, self.manifest["words"]["file"]))) if r.get("rival", True)])
+        return np.maximum(floor, np.sort(seen @ words.T, 1)[:, -max(1, int(share * len(words)))])
 
     def things(self, rows, margin=0.0, dim=0.0, context=True):
         """Unit rows of things as the server sees them: the cut, and their place in the whole photo where the bundle gives it."""
@@ -149,9 +160,9 @@ def collect(data, split, masks=None, most=10**9):
 def scores(bundle, rows, everyday, margin=0.0, dim=0.0, context=True):
     """The words, each thing's score of each of them, and the score that a word must reach."""
     names = sorted({n for r in rows for n in r[4]} | set(everyday.words))
-    text, canon = bundle.texts(names), bundle.texts(bundle.manifest["canon"])
+    text = bundle.texts(names)
     seen = bundle.things(rows, margin, dim, context)
-    return names, seen @ text.T, (seen @ canon.T).max(1) + bundle.manifest.get("margin", 0.0)
+    return names, seen @ text.T, bundle.floor(seen)
 
 
 def evaluate(rows, everyday, scored, shift=0.0):
@@ -188,9 +199,12 @@ def main():
     ap.add_argument("--cut", action="store_true", help="the cut alone, without the whole photo")
     ap.add_argument("--dim", type=float, default=0.0)
     ap.add_argument("--shift", type=float, nargs="+", default=[0.0], help="added to the canon's score, to see the trade")
+    ap.add_argument("--over", type=float, help="another margin over the canon than the bundle's")
+    ap.add_argument("--rivals", type=float, help="another share of the bundle's words than the bundle's that may fit a thing better")
     ap.add_argument("--detail", action="store_true")
     args = ap.parse_args()
     bundle = Bundle(args.bundle, image=args.image)
+    bundle.manifest |= {k: v for k, v in (("margin", args.over), ("rivals", args.rivals)) if v is not None}
     margin = bundle.manifest["image"].get("crop_margin", 0.0) if args.margin is None else args.margin
     everyday = Everyday(WordNet(args.wordnet))
     print("everyday words", len(everyday.words))

@@ -45,11 +45,11 @@ def boxes_of(label, rows):
 
 class Photos:
     """`pics` u8 [N,S,S,3], `labels` u8 [N,S,S], `size` [N,2]; a row of `things` is one mask: photo, index, class (-1: no name),
-    boxes or outline, x0, y0, x1, y1, area, set."""
+    boxes or outline, x0, y0, x1, y1, area, set. Sets of `without` are left out."""
 
-    def __init__(self, pack, withheld, device, limit=0, extra=None):
+    def __init__(self, pack, withheld, device, limit=0, extra=None, without=()):
         pics, labels, sizes, things, sets = [], [], [], [], []
-        self.names = [s for s in SHARES if os.path.exists(os.path.join(pack, f"photos_{s}.npz"))]
+        self.names = [s for s in SHARES if s not in without and os.path.exists(os.path.join(pack, f"photos_{s}.npz"))]
         for s, name in enumerate(self.names):
             with np.load(os.path.join(pack, f"photos_{name}.npz")) as z:
                 z = {k: z[k] for k in z.files}

@@ -1,6 +1,6 @@
 """Trains the image tower to name things in whole photos, its features pooled under their masks, and from cuts as before.
 
-    python train_pooled.py --pack PACK --out OUT --seconds S [--smoke]
+    python train_pooled.py --pack PACK --out OUT --seconds S [--without SET ...] [--smoke]
 
 It starts from the bundle's tower, batch norm folded, and moves little: a small learning rate, the mean of its weights, and
 for every mask of a photo, named or not, the tower that training begins with says what to keep. That teacher looks at a
@@ -223,7 +223,7 @@ def load(args, run, device):
     withheld = words.withheld.cpu().numpy()
     extra = outlined(args.pack, device, few)
     run.tell("outlined", len(extra), "photographs without labels, masks", sum(int(m.max()) for m in extra.values()))
-    photos = Photos(args.pack, withheld, device, few, extra)
+    photos = Photos(args.pack, withheld, device, few, extra, args.without)
     run.tell("photos", len(photos.pics), "things", len(photos.things), "with names", int((photos.things[:, 2] >= 0).sum()))
     tiles = class_labelled(args.pack, withheld, device, 64 if args.smoke else 0)
     canvases = Canvases(photos, tiles, Augment(device, args.seed + 1), device)
@@ -273,6 +273,7 @@ def arguments():
     ap.add_argument("--seconds", type=float, required=True, help="of wall-clock in all, preparation and last judgement included")
     ap.add_argument("--smoke", action="store_true", help="a few steps on a tiny subset, to see that all works")
     ap.add_argument("--seed", type=int, default=39)
+    ap.add_argument("--without", nargs="*", default=[], metavar="SET", help="sets that are judged, not learnt from")
     return ap.parse_args()
 
 

@@ -10,12 +10,13 @@ use crate::{
         ScoringMethod, SemanticsReport, StageTime, Warning,
     },
     service::{
-        BackgroundSpec, Boxes, CallerLimits, CameraSpec, Density, Event, ExportFormat, FeatureKind,
-        FeaturesSpec, Format, InstanceBox, KnownWord, Label, LensSpec, MaskFormat, MaskLevel,
-        Method, ModelInfo, ModelsInfo, Peak, PickSpec, Picked, PictureKind, PictureOptions,
-        PoseSpec, Preset, Quality, QueryAnswer, QuerySpec, RenderedView, SceneCamera, SceneError,
-        SceneOptions, SceneState, SceneStatus, ScoringOptions, SemanticsMode, SemanticsState,
-        SemanticsStatus, TextOptions, TextResult, TextView, TextWarning, Trust, ViewOptions,
+        BackgroundSpec, Boxes, CallerLimits, CameraSpec, Density, ERROR_FAST, Event, ExportFormat,
+        FeatureKind, FeaturesSpec, Format, InstanceBox, KnownWord, Label, LensSpec, MaskFormat,
+        MaskLevel, MaxError, Method, ModelInfo, ModelsInfo, Peak, PickSpec, Picked, PictureKind,
+        PictureOptions, PoseSpec, Preset, QueryAnswer, QuerySpec, RenderedView, SceneCamera,
+        SceneError, SceneOptions, SceneState, SceneStatus, ScoringOptions, SemanticsMode,
+        SemanticsState, SemanticsStatus, TextOptions, TextResult, TextView, TextWarning, Trust,
+        ViewOptions,
     },
 };
 
@@ -195,9 +196,12 @@ fn vec3(v: &pb::Vec3) -> [f64; 3] {
 /// How a view is rendered.
 pub(super) fn options(options: &pb::ViewOptions) -> Result<ViewOptions> {
     let &pb::ViewOptions { width, height, antialiased, near, front_photos, magnify, .. } = options;
-    let quality = value("quality", options.quality)?;
+    let error = match options.error {
+        Some(levels) => MaxError(levels),
+        None => value("quality", options.quality)?,
+    };
     let preset = given("preset", options.preset)?;
-    let of_view = ViewOptions { width, height, antialiased, near, quality, ..Default::default() };
+    let of_view = ViewOptions { width, height, antialiased, near, error, ..Default::default() };
     Ok(ViewOptions { preset, front_photos, magnify, ..of_view })
 }
 
@@ -257,9 +261,9 @@ pub(super) fn scene_options(header: &pb::CreateSceneHeader) -> Result<SceneOptio
 
 /// Changes of how texts are scored.
 fn scoring(scoring: Option<pb::Scoring>) -> ScoringOptions {
-    let pb::Scoring { canon, tau, cut, unit_rows, coverage_floor, near_best, margin } =
+    let pb::Scoring { canon, tau, cut, unit_rows, coverage_floor, near_best, margin, rivals } =
         scoring.unwrap_or_default();
-    ScoringOptions { canon, tau, cut, unit_rows, coverage_floor, near_best, margin }
+    ScoringOptions { canon, tau, cut, unit_rows, coverage_floor, near_best, margin, rivals }
 }
 
 fn scored(method: ScoringMethod) -> pb::Scoring {
@@ -271,6 +275,7 @@ fn scored(method: ScoringMethod) -> pb::Scoring {
         coverage_floor: Some(method.coverage_floor),
         near_best: Some(method.near_best),
         margin: Some(method.margin),
+        rivals: Some(method.rivals),
     }
 }
 
@@ -299,7 +304,7 @@ pub(super) fn picture(options: &pb::ViewOptions) -> Result<PictureOptions> {
 
 /// One encoded picture.
 pub(super) fn view(view: RenderedView) -> pb::View {
-    message!(View from view { width, height, depth_scale, etag }
+    message!(View from view { width, height, depth_scale, error, etag }
         render_ms: view.times.render_ms,
         camera_index: u32::try_from(view.camera_index).unwrap_or(u32::MAX),
         kind: pb::Kind::from(view.kind).into(),
@@ -354,6 +359,8 @@ pub(super) fn answer(answer: QueryAnswer) -> pb::QueryResponse {
 fn result(found: TextResult) -> pb::TextResult {
     let warning = |TextWarning { code, message }: TextWarning| pb::TextWarning { code, message };
     message!(TextResult from found { text, scores, found, gaussians }
+        word: found.word.unwrap_or_default(),
+        trust: found.trust.map(|trust| trust.to_string()).unwrap_or_default(),
         entries: found.entries.into_iter().map(u32::from).collect(),
         parts: found.parts.into_iter().map(part).collect(),
         warnings: found.warnings.into_iter().map(warning).collect(),
@@ -368,6 +375,7 @@ fn point([x, y, z]: [f64; 3]) -> pb::Vec3 {
 fn part(part: InstanceBox) -> pb::Part {
     pb::Part {
         gaussians: part.gaussians,
+        score: part.score,
         center: Some(point(part.center)),
         axes: part.axes.iter().copied().map(point).collect(),
         size: Some(point(part.size)),
@@ -498,12 +506,21 @@ both_ways! {
     Density = Density { Thinned, Full }
     PictureKind = Kind { Color, Depth, Alpha, Semantics, Relevancy, Mask }
     Format = Format { Png, Jpeg, Webp, Npy, Rgb8, Rgba8, Grey8 }
-    Quality = Quality { Exact, Fast }
     Preset = Preset { Default, Paper }
     MaskLevel = MaskLevel { Widest, Whole, Part, Subpart }
     FeatureKind = FeatureKind { Weights, Features }
     Boxes = Boxes { Oriented, Upright, Aligned, None }
     MaskFormat = MaskFormat { Rle, Png, None }
+}
+
+/// Names of two errors.
+impl FromNumber for MaxError {
+    fn from_number(number: i32) -> Option<Self> {
+        Some(match pb::Quality::try_from(number).ok()? {
+            pb::Quality::Unspecified | pb::Quality::Exact => Self::default(),
+            pb::Quality::Fast => Self(ERROR_FAST),
+        })
+    }
 }
 
 /// The table of formats has the numbers of the message.

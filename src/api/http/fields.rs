@@ -297,6 +297,9 @@ impl<'de> Deserializer<'de> for Value {
             (Given::Json(serde_json::Value::Number(number)), _) if number.is_u64() => {
                 visitor.visit_u64(number.as_u64().unwrap_or_default())
             }
+            (Given::Json(serde_json::Value::Number(number)), _) => {
+                visitor.visit_f64(number.as_f64().unwrap_or_default())
+            }
             (Given::List(_), _) => self.deserialize_seq(visitor),
             _ => return Err(wrong),
         };

@@ -203,6 +203,7 @@ fn bounds(limits: &Limits) -> Value {
         "tau": range(TAU_RANGE),
         "cut": range([0.0, 1.0]), "coverage_floor": range([0.0, 1.0]),
         "near_best": range([0.0, ScoringMethod::NEAR_BEST_MAX]), "margin": range([-2.0, 2.0]),
+        "rivals": range([0.0, 1.0]),
         "cameras": some(&Value::Null, limits.cameras_max),
         "kinds": some(&Value::Null, limits.kinds_max),
     })

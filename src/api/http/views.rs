@@ -192,6 +192,7 @@ fn index_row(name: &str, view: &RenderedView) -> serde_json::Value {
         "content_type": content_type(view.format),
         "camera": view.camera,
         "depth_scale": view.depth_scale,
+        "error": view.error,
         "shape": view.shape(),
     })
 }

@@ -188,6 +188,7 @@ impl Ask {
                 Some(other) => panic!("quality {other} is not in the proto"),
             }
             .into(),
+            error: self.number("error"),
         }
     }
 
@@ -314,10 +315,19 @@ impl Door {
 
     /// The bytes of one view.
     pub(crate) async fn view(&self, id: &str, ask: &Ask) -> Result<Vec<u8>, Fault> {
+        Ok(self.bounded(id, ask).await?.0)
+    }
+
+    /// The same, and the bound of its error.
+    pub(crate) async fn bounded(&self, id: &str, ask: &Ask) -> Result<(Vec<u8>, f32), Fault> {
         match self {
             Self::Http { base, client } => {
                 let url = url(base, &format!("/v1/scenes/{id}/view"), &ask.pairs);
-                bytes(client.get(url).send().await.expect("an answer")).await
+                let answer = client.get(url).send().await.expect("an answer");
+                let told = answer.headers().get("x-error").cloned();
+                let file = bytes(answer).await?;
+                let told = told.expect("x-error").to_str().expect("a text").parse();
+                Ok((file, told.expect("a number")))
             }
             Self::Grpc { client } => {
                 let request = pb::RenderViewRequest {
@@ -329,7 +339,8 @@ impl Door {
                     ..Default::default()
                 };
                 let view = client.clone().render_view(request).await.map_err(fault_of)?;
-                Ok(view.into_inner().data.to_vec())
+                let view = view.into_inner();
+                Ok((view.data.to_vec(), view.error))
             }
         }
     }

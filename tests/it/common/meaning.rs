@@ -68,7 +68,7 @@ impl SemanticNetworks for PhotoMeaning {
     fn phrases(&self) -> Result<Phrases> {
         self.asked_on.lock().unwrap().push(std::thread::current().id());
         let canon = ["object", "things", "stuff"].map(str::to_owned).to_vec();
-        Ok(Phrases { canon, tau: 10.0, coverage_floor: 0.05, margin: 0.0 })
+        Ok(Phrases { canon, tau: 10.0, coverage_floor: 0.05, margin: 0.0, rivals: 1.0 })
     }
 
     fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {

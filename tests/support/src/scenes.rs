@@ -112,6 +112,36 @@ pub fn two_views(side: u32, seed: u64) -> (Gaussians, Camera) {
     (checked(raw), middle)
 }
 
+/// `layers` sheets of `side` x `side` wide Gaussians in front of [`camera`], one behind the other,
+/// black and white in turn. With a low `opacity` light passes many of them.
+pub fn sheets(layers: u32, side: u32, opacity: f32, seed: u64) -> Gaussians {
+    let mut random = Random(seed);
+    let mut raw = RawGaussians::default();
+    for layer in 0..layers {
+        let z = 2.0 + 0.05 * layer as f32;
+        let step = 1.4 * z / side as f32;
+        let color = if layer % 2 == 0 { 1.7 } else { -1.7 };
+        for (y, x) in (0..side).flat_map(|y| (0..side).map(move |x| (y, x))) {
+            let place = |at: u32| (at as f32 - 0.5 * (side - 1) as f32) * step;
+            let mean = [place(x), place(y), z + random.range(-0.01, 0.01)];
+            let scale = [0.8 * step, 0.8 * step, 0.01];
+            push(&mut raw, mean, [1.0, 0.0, 0.0, 0.0], scale, opacity, &[[color; 3]]);
+        }
+    }
+    checked(raw)
+}
+
+/// `count` needles, a thousand times as long as thick, in front of [`camera`].
+pub fn needles(count: usize, seed: u64) -> Gaussians {
+    let mut raw = cloud(count, 0, seed).into_raw();
+    let mut random = Random(seed + 1);
+    for (mean, scale) in raw.means.iter().zip(&mut raw.scales) {
+        let length = mean[2].abs() * random.range(0.02, 0.3);
+        *scale = [length, 1e-3 * length, 1e-3 * length];
+    }
+    checked(raw)
+}
+
 /// `count` Gaussians of all shapes in a box in front of [`camera`], harmonics of `sh_degree`.
 pub fn cloud(count: usize, sh_degree: u8, seed: u64) -> Gaussians {
     let mut random = Random(seed);

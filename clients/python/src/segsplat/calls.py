@@ -499,7 +499,7 @@ def query(
     scene: Handle,
     *texts: str | Sequence[str],
     masks: bool = True,
-    boxes: Literal["oriented", "upright", "aligned", "none"] = "oriented",
+    boxes: Literal["oriented", "upright", "aligned", "none"] = "upright",
     **options: Unpack[QueryCall],
 ) -> Flow[Matches]:
     """Asks where things are: boxes and Gaussians in 3D, and masks in one view.

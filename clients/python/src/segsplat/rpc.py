@@ -48,7 +48,7 @@ METHODS = {
     **{"refine": "RefineScene", "features": "Features"},
     **{"POST": "CreateScene", "GET": "GetScene", "DELETE": "DeleteScene"},
 }
-SCORING = ("canon", "tau", "cut", "unit_rows", "coverage_floor", "near_best", "margin")
+SCORING = ("canon", "tau", "cut", "unit_rows", "coverage_floor", "near_best", "margin", "rivals")
 NAMED = {"black": "#000000", "white": "#ffffff"}
 
 
@@ -180,6 +180,8 @@ def _camera(fields: dict[str, Any]) -> dict[str, Any]:
 
 def _options(fields: dict[str, Any]) -> dict[str, Any]:
     """How a view is drawn."""
+    if isinstance(fields.get("error"), str):
+        fields["quality"] = fields.pop("error")
     fields |= {n: _enum(n, fields[n]) for n in ("format", "quality", "preset") if n in fields}
     if "crop" in fields:
         fields["crop"] = dict(zip(("x", "y", "width", "height"), fields["crop"], strict=True))

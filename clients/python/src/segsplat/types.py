@@ -150,8 +150,9 @@ class Drawing(TypedDict, total=False):
     antialiased: bool
     #: Near plane, world units.
     near: float
-    #: "fast" may leave out precision within a stated bound.
-    quality: Literal["exact", "fast"]
+    #: Largest difference to the exact picture that is accepted for less time, levels of 255: 0 to
+    #: 32, "exact" (0) or "fast" (2). Views with depth are exact.
+    error: float | Literal["exact", "fast"]
     #: "paper" draws and scores as the paper does; that of the scene by default.
     preset: Preset
     #: Photos whose Gaussians are in front, the nearest ones; 0: those of all. That of the preset by
@@ -188,6 +189,9 @@ class TextOptions(TypedDict, total=False):
     near_best: float
     #: Difference of cosines to the canonical texts at which the relevancy is 0.5, -2 to 2.
     margin: float
+    #: Share of the bundle's list of words that may fit an entry better than the text, 0 to 1; 1:
+    #: the list does not count.
+    rivals: float
     #: Seconds to wait for semantics that are being made; the server's limit by default.
     wait: float
 
@@ -534,6 +538,8 @@ class Box:
 
     #: Gaussians in it.
     gaussians: int
+    #: Relevancy of its best entry, 0 to 1; of those that a tenth of its Gaussians have.
+    score: float
     #: [3] centre, world units.
     center: Floats
     #: [3, 3] unit axes, one a row.
@@ -579,8 +585,12 @@ class Match:
     found: bool
     #: Gaussians selected.
     gaussians: int
-    #: One box for each connected part, the largest first.
+    #: One box for each connected part, the one with the best score first.
     boxes: tuple[Box, ...]
+    #: The measured word that the text is about, one of `Models.words`; None where there is none.
+    word: str | None
+    #: What to expect of that word: good, fair, poor or unmeasured.
+    trust: str | None
     #: What makes the answer doubtful.
     warnings: tuple[Doubt, ...]
     #: [H, W] bool, the pixels of the view.
@@ -604,10 +614,19 @@ class Match:
             found=data["found"],
             gaussians=data["gaussians"],
             boxes=tuple(parse(Box, part) for part in data["parts"]),
+            word=data.get("word") or None,
+            trust=data.get("trust") or None,
             warnings=tuple(parse(Doubt, one) for one in data["warnings"]),
             mask=decode_rle(view["mask_rle"]) if "mask_rle" in view else np.zeros((0, 0), bool),
             peak=parse(Peak, view["peak"]) if view.get("peak") else None,
         )
+
+    def __str__(self) -> str:
+        """`fox: 8,120 Gaussians in 1 part, score 0.86 (good)`, or `fox: not found (good)`."""
+        parts = f"{len(self.boxes)} part{'s' * (len(self.boxes) != 1)}"
+        found = f"{self.gaussians:,} Gaussians in {parts}, score {self.score:.2f}"
+        trust = self.trust or "no word that was measured"
+        return f"{self.text}: {found if self.found else 'not found'} ({trust})"
 
     def _repr_png_(self) -> bytes | None:
         return encode_png(self.mask.astype(np.uint8) * 255) if self.mask.size else None
@@ -631,6 +650,8 @@ class Scoring:
     near_best: float
     #: Difference of cosines to the canonical texts at which the relevancy is 0.5.
     margin: float
+    #: Share of the bundle's list of words that may fit an entry better than the text, 0 to 1.
+    rivals: float
 
 
 class Matches(Sequence[Match]):

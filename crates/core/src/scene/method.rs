@@ -259,6 +259,9 @@ pub struct ScoringMethod {
     pub cut: f64,
     /// An entry that fits a text by so much less than the best one (cosine, 0..2) is not selected.
     pub near_best: f64,
+    /// Share of the bundle's list of words that may fit an entry better than the text, 0..1; 1: the
+    /// list does not count.
+    pub rivals: f64,
 }
 
 impl ScoringMethod {
@@ -280,6 +283,7 @@ impl ScoringMethod {
         tau: f64,
         coverage_floor: f64,
         margin: f64,
+        rivals: f64,
     ) -> Self {
         match preset {
             Preset::Default => Self {
@@ -290,6 +294,7 @@ impl ScoringMethod {
                 margin,
                 cut: Self::CUT,
                 near_best: Self::NEAR_BEST,
+                rivals,
             },
             Preset::Paper => Self {
                 unit_rows: false,
@@ -299,6 +304,7 @@ impl ScoringMethod {
                 margin: 0.0,
                 cut: Self::CUT,
                 near_best: Self::NEAR_BEST_MAX,
+                rivals: 1.0,
             },
         }
     }
@@ -318,6 +324,7 @@ impl ScoringMethod {
         within("coverage_floor", self.coverage_floor, [0.0, 1.0])?;
         within("margin", self.margin, [-2.0, 2.0])?;
         within("cut", self.cut, [0.0, 1.0])?;
+        within("rivals", self.rivals, [0.0, 1.0])?;
         within("near_best", self.near_best, [0.0, Self::NEAR_BEST_MAX])
     }
 }
@@ -362,9 +369,10 @@ mod tests {
         assert_eq!(lambda, "lambda is 0; it must be 0.01 to 100");
         assert!(bad(Method { lambda: f64::NAN, ..Method::default() }).contains("lambda is NaN"));
         assert!(bad(Method { bank_rows: 5000, ..Method::default() }).contains("0 to 4096"));
-        let scoring = ScoringMethod::of(Preset::Paper, Vec::new(), 0.0, 0.0, 0.0);
+        let scoring = ScoringMethod::of(Preset::Paper, Vec::new(), 0.0, 0.0, 0.0, 1.0);
         scoring.check().unwrap();
         assert!(ScoringMethod { cut: 1.5, ..scoring.clone() }.check().is_err());
+        assert!(ScoringMethod { rivals: -0.1, ..scoring.clone() }.check().is_err());
         assert!(ScoringMethod { canon: Vec::new(), ..scoring }.check().is_err());
     }
 

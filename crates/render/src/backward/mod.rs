@@ -98,7 +98,8 @@ impl<T: Copy + Default> Gradients<T> {
 /// The request as it is drawn for a backward pass.
 pub(crate) fn backward_request(request: &RenderRequest) -> RenderRequest {
     let kinds = Kinds { depth: request.kinds.depth, ..Kinds { depth: false, ..Kinds::ALL } };
-    RenderRequest { kinds, labels: Labels::None, samples: Samples::F32, ..request.clone() }
+    let (labels, samples) = (Labels::None, Samples::F32);
+    RenderRequest { kinds, labels, samples, error: 0.0, ..request.clone() }
 }
 
 /// Derivatives of the 16 basis functions up to degree 3 by the unit direction (x, y, z).

@@ -135,7 +135,7 @@ impl Pass<'_> {
 
     /// What each tile says.
     fn tiles(&self) -> Vec<TileSums> {
-        let paint = Paint::new(self.request, self.view, &[], self.options);
+        let paint = Paint::new(self.request, self.view, &[], 0.0, self.options);
         let tiles_x = self.grid.tiles_x();
         let of_tile = |tile: u32| {
             let mut out = TileSums::default();

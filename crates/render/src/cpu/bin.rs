@@ -13,6 +13,7 @@ use std::{
 use rayon::prelude::*;
 
 use super::{
+    cull::Shown,
     project::Projected,
     tiles::{Grid, TileSpans},
 };
@@ -85,10 +86,10 @@ impl<'a> DepthKeys<'a> {
     }
 
     #[inline]
-    fn pair(&self, depth: f32, id: usize) -> u64 {
+    fn pair(&self, depth: f32, id: usize, shown: &Shown) -> u64 {
         let mut key = depth.to_bits();
         if !self.sources.is_empty() {
-            let view = usize::from(self.gaussians.source()[id].view);
+            let view = usize::from(self.gaussians.source()[shown.id(id)].view);
             if self.sources.get(view).is_some_and(|source| source.behind) {
                 key |= BEHIND_BIT;
             }
@@ -149,7 +150,8 @@ impl Bins {
         pairs.resize(emitted.len(), 0);
         for &tile in &*emitted {
             let (place, id) = (&mut ends[key(tile) as usize], value(tile) as usize);
-            pairs[*place as usize] = keys.pair(projected.footprints[id].depth, id);
+            pairs[*place as usize] =
+                keys.pair(projected.footprints[id].depth, id, &projected.shown);
             *place += 1;
         }
     }

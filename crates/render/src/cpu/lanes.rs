@@ -100,6 +100,13 @@ pub(super) trait Lanes: Simd {
         self.mul_add_f64s(a, b, c)
     }
 
+    /// `|a|`. That of `pulp` is a call for each vector: its `not_f32s` is not compiled for the
+    /// width of the caller.
+    #[inline(always)]
+    fn abs(self, a: Self::f32s) -> Self::f32s {
+        self.max_f32s(a, self.sub_f32s(self.splat_f32s(0.0), a))
+    }
+
     /// Vector `i` of a row of numbers.
     #[inline(always)]
     fn load(self, row: &[f32; 16], i: usize) -> Self::f32s {

@@ -8,6 +8,7 @@
 pub mod backward;
 pub mod bin;
 pub mod cell;
+pub mod cull;
 pub mod footprint;
 pub mod lanes;
 pub mod paint;
@@ -19,7 +20,7 @@ mod sky;
 pub mod store;
 pub mod tiles;
 
-use std::{ops::Range, time::Instant};
+use std::{borrow::Cow, ops::Range, time::Instant};
 
 use rayon::prelude::*;
 
@@ -27,6 +28,7 @@ use self::{
     backward::{BackwardScratch, Pass, Pictures},
     bin::{Bins, DepthKeys},
     cell::{Tile, TileScratch},
+    cull::Shown,
     footprint::Footprint,
     lanes::KernelOptions,
     paint::Paint,
@@ -39,6 +41,7 @@ use self::{
 use super::{
     Frame, Labels, RenderRequest,
     backward::{FrameGradients, Gradients, backward_request},
+    blocks::{BlockCache, Blocks, Frustum, blocks_from},
     constants::{ISECTS_MAX, TILE_SIZE},
     labels::WeightRows,
     renderer::{DeviceTimes, DifferentiableRenderer, DispatchTime, Renderer},
@@ -50,7 +53,7 @@ use crate::{
     scene::Gaussians,
 };
 
-/// Scratch with more Gaussians than this is freed after the frame instead of kept.
+/// Scratch of more Gaussians than this is freed after the frame instead of kept.
 const KEPT_GAUSSIANS_MAX: usize = 2 << 20;
 /// Tasks of the blend for each thread: tiles differ much in their work.
 const TASKS_A_THREAD: usize = 16;
@@ -63,6 +66,7 @@ pub struct CpuRenderer {
     frames: Pool<FrameScratch>,
     tiles: Pool<TileScratch>,
     backwards: Pool<BackwardScratch>,
+    blocks: BlockCache,
     isects_max: u64,
     options: KernelOptions,
 }
@@ -98,6 +102,7 @@ impl CpuRenderer {
             frames: Pool::default(),
             tiles: Pool::default(),
             backwards: Pool::default(),
+            blocks: BlockCache::new(blocks_from(switches)),
             isects_max: switches.isects_max().unwrap_or(ISECTS_MAX).into(),
             options: KernelOptions::new(switches),
         })
@@ -109,18 +114,21 @@ impl CpuRenderer {
         gaussians: &Gaussians,
         request: &RenderRequest,
     ) -> Result<(Frame, Vec<DispatchTime>)> {
+        let blocks = self.blocks.get(gaussians);
         let mut scratch = self.frames.take();
-        let timed = self.draw_into(gaussians, request, &mut scratch)?;
-        if gaussians.len() <= KEPT_GAUSSIANS_MAX {
+        let timed = self.draw_into(gaussians, blocks.as_deref(), request, &mut scratch)?;
+        if scratch.projected.footprints.len() <= KEPT_GAUSSIANS_MAX {
             self.frames.give(scratch);
         }
         Ok(timed)
     }
 
-    /// The same; footprints, and the pairs of the last band, stay in `scratch`.
+    /// The same, with the blocks of the scene where it has some; footprints, and the pairs of the
+    /// last band, stay in `scratch`.
     fn draw_into(
         &self,
         gaussians: &Gaussians,
+        blocks: Option<&Blocks>,
         request: &RenderRequest,
         scratch: &mut FrameScratch,
     ) -> Result<(Frame, Vec<DispatchTime>)> {
@@ -130,17 +138,27 @@ impl CpuRenderer {
         let mut frame = Frame::blank([view.width, view.height], request, pixels);
         let options = self.options;
         clock.ended("begin");
+        scratch.projected.shown = match blocks {
+            Some(blocks) => Shown::of(blocks, &Frustum::new(&view, request)),
+            None => Shown::All,
+        };
+        clock.ended("cull");
         project::project(gaussians, request, &view, options, &mut scratch.projected);
         clock.ended("project");
+        let mut brightest = 0.0;
         if request.kinds.color {
-            shade::shade(gaussians, &view, options, &mut scratch.projected);
+            brightest = shade::shade(gaussians, &view, options, &mut scratch.projected);
             clock.ended("shade");
         }
         let seen = scratch.projected.tiles_per_gauss.par_iter().with_min_len(1 << 14);
         frame.stats.visible = seen.filter(|&&tiles| tiles > 0).count() as u64;
+        let entries = match request.labels {
+            Labels::None => Cow::default(),
+            _ => scratch.projected.shown.only(gaussians.semantic_index()),
+        };
         let mut band = Band {
             keys: DepthKeys::new(gaussians, &request.sources),
-            paint: Paint::new(request, &view, gaussians.semantic_index(), options),
+            paint: Paint::new(request, &view, &entries, brightest, options),
             weights: Vec::new(),
         };
         self.draw_band(&Grid::whole(&view, options), &mut band, scratch, &mut frame, &mut clock)?;
@@ -238,7 +256,7 @@ pub(super) fn background(view: &View, request: &RenderRequest) -> Result<Frame> 
     let mut frame = Frame::blank([view.width, view.height], request, pixels);
     let options = KernelOptions::default();
     let grid = Grid::whole(view, options);
-    let paint = Paint::new(request, view, &[], options);
+    let paint = Paint::new(request, view, &[], 0.0, options);
     let weights = rasterize(&grid, &paint, &[], &[], &Pool::default(), &mut frame);
     if request.labels == Labels::Weights {
         frame.weights = Some(WeightRows::join(weights)?);
@@ -279,6 +297,11 @@ impl Renderer for CpuRenderer {
         self.threads.install(|| self.draw(gaussians, request)).map(|(frame, _)| frame)
     }
 
+    fn prepare(&self, gaussians: &Gaussians) -> Result<()> {
+        self.threads.install(|| self.blocks.get(gaussians));
+        Ok(())
+    }
+
     fn device_times(
         &self,
         gaussians: &Gaussians,
@@ -301,7 +324,7 @@ impl DifferentiableRenderer for CpuRenderer {
         let request = backward_request(request);
         let mut scratch = self.frames.take();
         let (frame, _) =
-            self.threads.install(|| self.draw_into(gaussians, &request, &mut scratch))?;
+            self.threads.install(|| self.draw_into(gaussians, None, &request, &mut scratch))?;
         if frame.stats.intersections > self.isects_max {
             let what = "backward: Gaussian-tile pairs of a view";
             return Err(Error::limit(what, frame.stats.intersections, self.isects_max));

@@ -2,7 +2,12 @@
 //! options of the kernels.
 
 use super::{footprint::Footprint, lanes::KernelOptions, sky::Sky};
-use crate::{Background, Kinds, Labels, RenderRequest, Samples, labels::BLEND_WIDTH, view::View};
+use crate::{
+    Background, Kinds, Labels, RenderRequest, Samples,
+    budget::{Budget, RayEnd},
+    labels::BLEND_WIDTH,
+    view::View,
+};
 
 /// Most channels: colour, depth, labels.
 pub(super) const CHANNELS: usize = 3 + 1 + BLEND_WIDTH;
@@ -27,16 +32,19 @@ pub struct Paint<'a> {
     pub(super) labels: &'a Labels,
     /// `[N]` entry of each Gaussian.
     pub(super) entries: &'a [u16],
+    /// Where rays end.
+    pub(super) ray_end: RayEnd,
     pub(super) options: KernelOptions,
 }
 
 impl<'a> Paint<'a> {
     /// The blend of `request`, of which `view` is the camera, of Gaussians with these entries,
-    /// `[N]`.
+    /// `[N]`, and colours up to `brightest`.
     pub fn new(
         request: &'a RenderRequest,
         view: &View,
         entries: &'a [u16],
+        brightest: f32,
         options: KernelOptions,
     ) -> Self {
         let RenderRequest { kinds, background, samples, labels, .. } = request;
@@ -44,7 +52,8 @@ impl<'a> Paint<'a> {
             Background::Color(color) => Behind::Color(*color),
             Background::Backdrop(backdrop) => Behind::Sky(Sky::new(backdrop, view)),
         };
-        Self { kinds: *kinds, behind, samples: *samples, labels, entries, options }
+        let ray_end = RayEnd::new(Budget::of(request).rays, request, brightest);
+        Self { kinds: *kinds, behind, samples: *samples, labels, entries, ray_end, options }
     }
 
     /// Whether colour is asked for.

@@ -1,11 +1,13 @@
 //! Stage 1: Gaussians to footprints; some are dropped. Shader: `shaders/project.wgsl`
 //!
-//! In: means, quats, scales, opacities `[N]`. Out: [`Footprint`] `[N]`. A dropped Gaussian touches
-//! no tile (`tiles_per_gauss` is 0). All arithmetic is f64; the results become f32 at the end.
+//! In: means, quats, scales, opacities `[N]` of the Gaussians shown. Out: [`Footprint`] `[N]`. A
+//! dropped Gaussian touches no tile (`tiles_per_gauss` is 0). All arithmetic is f64; the results
+//! become f32 at the end.
 
 use rayon::prelude::*;
 
 use super::{
+    cull::Shown,
     footprint::Footprint,
     lanes::{KernelOptions, LaneKernel, Lanes, Row, Wide},
     tiles::{BLOCK, Ellipses, Grid, TileSpans},
@@ -23,6 +25,8 @@ const CHUNK: usize = 1024;
 /// Output of the stage, `[N]` each.
 #[derive(Debug, Default)]
 pub struct Projected {
+    /// The Gaussians that are projected; set by the stage before.
+    pub shown: Shown,
     /// Footprints; undefined where dropped.
     pub footprints: Vec<Footprint>,
     /// Tiles touched, for the emission; undefined where dropped.
@@ -31,8 +35,8 @@ pub struct Projected {
     pub tiles_per_gauss: Vec<u32>,
 }
 
-/// Projects every Gaussian for `request`, of which `view` is the camera. `tiles_per_gauss[i]` is 0
-/// if Gaussian i is dropped.
+/// Projects the Gaussians that are shown for `request`, of which `view` is the camera.
+/// `tiles_per_gauss[i]` is 0 if Gaussian i of them is dropped.
 pub fn project(
     gaussians: &Gaussians,
     request: &RenderRequest,
@@ -40,8 +44,9 @@ pub fn project(
     options: KernelOptions,
     projected: &mut Projected,
 ) {
-    let count = gaussians.len();
-    let Projected { footprints, tile_spans, tiles_per_gauss } = projected;
+    let Projected { shown, footprints, tile_spans, tiles_per_gauss } = projected;
+    let count = shown.len(gaussians.len());
+    let shown = &*shown;
     footprints.resize(count, Footprint::default());
     tile_spans.resize(count, TileSpans::default());
     tiles_per_gauss.resize(count, 0);
@@ -52,13 +57,14 @@ pub fn project(
     chunks.enumerate().for_each(|(chunk, ((footprints, spans), tiles))| {
         let first = chunk * CHUNK;
         let out = (footprints, spans, tiles);
-        options.width.run(Chunk { gaussians, request, view, options, first, out });
+        options.width.run(Chunk { gaussians, shown, request, view, options, first, out });
     });
 }
 
 /// Gaussians of a task and where their footprints go.
 struct Chunk<'a> {
     gaussians: &'a Gaussians,
+    shown: &'a Shown,
     request: &'a RenderRequest,
     view: &'a View,
     options: KernelOptions,
@@ -78,9 +84,11 @@ impl LaneKernel for Chunk<'_> {
         for (at, ((footprints, spans), tiles)) in out {
             tiles.fill(0);
             let first = self.first + at * BLOCK;
-            block.load(self.gaussians, first, footprints.len());
+            let ids = &mut [0; BLOCK][..footprints.len()];
+            (first..).zip(&mut *ids).for_each(|(at, id)| *id = self.shown.id(at));
+            block.load(self.gaussians, ids);
             if magnifies {
-                block.load_widths(self.gaussians, first, footprints.len(), &request.sources);
+                block.load_widths(self.gaussians, ids, &request.sources);
             }
             if !block.project(simd, view, request.antialiased, magnifies) {
                 continue;
@@ -123,36 +131,26 @@ struct Block {
 
 impl Block {
     #[inline(always)]
-    fn load(&mut self, gaussians: &Gaussians, first: usize, count: usize) {
-        let places = first..first + count;
-        let rows = gaussians.means()[places.clone()].iter().zip(&gaussians.quats()[places.clone()]);
-        let rows = rows.zip(&gaussians.scales()[places.clone()]);
-        let rows = rows.zip(&gaussians.opacities()[places]);
-        for (k, (((mean, quat), scale), opacity)) in rows.enumerate() {
-            for (row, &value) in self.mean.iter_mut().zip(mean) {
+    fn load(&mut self, gaussians: &Gaussians, ids: &[usize]) {
+        for (k, &id) in ids.iter().enumerate() {
+            for (row, value) in self.mean.iter_mut().zip(gaussians.means()[id]) {
                 row[k] = f64::from(value);
             }
-            for (row, &value) in self.scale.iter_mut().zip(scale) {
+            for (row, value) in self.scale.iter_mut().zip(gaussians.scales()[id]) {
                 row[k] = f64::from(value);
             }
-            for (row, &value) in self.quat.iter_mut().zip(quat) {
+            for (row, value) in self.quat.iter_mut().zip(gaussians.quats()[id]) {
                 row[k] = f64::from(value);
             }
-            self.opacity[k] = f64::from(*opacity);
+            self.opacity[k] = f64::from(gaussians.opacities()[id]);
         }
     }
 
     #[inline(always)]
-    fn load_widths(
-        &mut self,
-        gaussians: &Gaussians,
-        first: usize,
-        count: usize,
-        sources: &[Source],
-    ) {
-        for (k, of) in gaussians.source()[first..first + count].iter().enumerate() {
+    fn load_widths(&mut self, gaussians: &Gaussians, ids: &[usize], sources: &[Source]) {
+        for (k, &id) in ids.iter().enumerate() {
             self.width[k] = 0.0;
-            if let Some(source) = sources.get(usize::from(of.view)) {
+            if let Some(source) = sources.get(usize::from(gaussians.source()[id].view)) {
                 let mut depth = 0.0;
                 for (axis, mean) in self.mean.iter().enumerate() {
                     let from = mean[k] - f64::from(source.center[axis]);

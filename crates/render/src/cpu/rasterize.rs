@@ -89,7 +89,9 @@ impl Blend<'_> {
     fn blend<S: Lanes, const K: usize, const WEIGHTS: bool>(self, simd: S) {
         let Self { footprints, pairs, tile, paint, scratch } = self;
         let by_parts = paint.options.skips(Skip::EllipseParts);
+        // Without the skip no ray is short enough.
         let ends = paint.options.skips(Skip::EndedRays);
+        let ray_end = if ends { paint.ray_end.transmittance } else { -1.0 };
         let mut open = clear(&mut scratch.cells, tile);
         let mut rest = Rest::new(pairs);
         let mut sorted: &[u64] = &[];
@@ -136,10 +138,17 @@ impl Blend<'_> {
                 let mut goes_on = false;
                 for i in 0..PIXELS / S::F32_LANES {
                     let staged = &scratch.staged;
-                    goes_on |=
-                        blend_cell::<S, K, WEIGHTS>(simd, (at, i), ends, cell, staged, marks, sums);
+                    goes_on |= blend_cell::<S, K, WEIGHTS>(
+                        simd,
+                        (at, i),
+                        ray_end,
+                        cell,
+                        staged,
+                        marks,
+                        sums,
+                    );
                 }
-                if ends && !goes_on {
+                if !goes_on {
                     open &= !(1 << at);
                 }
             }
@@ -261,8 +270,8 @@ pub(super) fn met<S: Lanes>(simd: S, gaussian: &Staged) -> u16 {
     for i in 0..CELLS / S::F32_LANES {
         let (x, y) = (CELL_X.at(simd, i), CELL_Y.at(simd, i));
         let (u, v) = along_axes(simd, gaussian, x, y);
-        let du = simd.max_f32s(simd.sub_f32s(simd.abs_f32s(u), wide), zero);
-        let dv = simd.max_f32s(simd.sub_f32s(simd.abs_f32s(v), tall), zero);
+        let du = simd.max_f32s(simd.sub_f32s(simd.abs(u), wide), zero);
+        let dv = simd.max_f32s(simd.sub_f32s(simd.abs(v), tall), zero);
         let nearest = simd.fused(du, du, simd.mul_f32s(dv, dv));
         let near = simd.less_than_or_equal_f32s(nearest, simd.splat_f32s(gaussian.power_max));
         bits |= simd.bits(near) << (i * S::F32_LANES);
@@ -285,12 +294,12 @@ pub(super) fn along_axes<S: Lanes>(
 }
 
 /// Blends the marked Gaussians into vector `i` of cell `at`: K channels and the bins. Returns
-/// whether any ray goes on. If `ends`, it stops when none does.
+/// whether any ray goes on: has a transmittance over `ray_end`. It stops when none does.
 #[inline(always)]
 fn blend_cell<S: Lanes, const K: usize, const WEIGHTS: bool>(
     simd: S,
     (at, i): (usize, usize),
-    ends: bool,
+    ray_end: f32,
     cell: &mut Cell,
     staged: &[Staged],
     marks: &[[u64; CELLS]],
@@ -298,6 +307,7 @@ fn blend_cell<S: Lanes, const K: usize, const WEIGHTS: bool>(
 ) -> bool {
     let zero = simd.splat_f32s(0.0);
     let end = simd.splat_f32s(TRANSMITTANCE_MIN);
+    let ray_end = simd.splat_f32s(ray_end);
     let x = simd.add_f32s(PIXEL_X.at(simd, i), simd.splat_f32s(CELL_X.0[at]));
     let y = simd.add_f32s(PIXEL_Y.at(simd, i), simd.splat_f32s(CELL_Y.0[at]));
     let mut transmittance = cell.transmittance.at(simd, i);
@@ -330,7 +340,7 @@ fn blend_cell<S: Lanes, const K: usize, const WEIGHTS: bool>(
             if WEIGHTS && let Some(sum) = sums.get_mut(gaussian.bin as usize) {
                 sum.put(simd, i, simd.add_f32s(sum.at(simd, i), weight));
             }
-            if simd.bits(lives) == 0 && ends {
+            if simd.bits(simd.greater_than_f32s(transmittance, ray_end)) == 0 {
                 goes_on = false;
                 break 'all;
             }

@@ -18,32 +18,36 @@ const CHUNK: usize = 1024;
 
 /// Writes the colour of every visible footprint, in place. The footprints keep the order of the
 /// scene, which suits the rasteriser's cache better than depth order. A scene of degree 0 looks the
-/// same from everywhere, so no direction is computed.
+/// same from everywhere, so no direction is computed. Returns the largest number of a colour.
 pub fn shade(
     gaussians: &Gaussians,
     view: &View,
     options: KernelOptions,
     projected: &mut Projected,
-) {
+) -> f32 {
     let flat = gaussians.sh_count() == 1 && options.skips(Skip::FlatColor);
     let coefficients = gaussians.sh_count();
-    let chunks = projected.footprints.par_chunks_mut(CHUNK);
-    chunks.zip(projected.tiles_per_gauss.par_chunks(CHUNK)).enumerate().for_each(
-        |(chunk, (footprints, tiles))| {
-            for (k, (footprint, &tiles)) in footprints.iter_mut().zip(tiles).enumerate() {
-                if tiles > 0 {
-                    let i = chunk * CHUNK + k;
-                    let sh = &gaussians.sh()[i * coefficients..(i + 1) * coefficients];
-                    footprint.color = if flat {
-                        sh[0].map(|value| (SH_OFFSET + SH_C0 * value).max(0.0))
-                    } else {
-                        let mean = DVec3::from(gaussians.means()[i].map(f64::from));
-                        color(sh, mean - view.center)
-                    };
-                }
+    let Projected { shown, footprints, tiles_per_gauss, .. } = projected;
+    let chunks = footprints.par_chunks_mut(CHUNK);
+    let chunks = chunks.zip(tiles_per_gauss.par_chunks(CHUNK)).enumerate();
+    let brightest = chunks.map(|(chunk, (footprints, tiles))| {
+        let mut brightest = 0.0_f32;
+        for (k, (footprint, &tiles)) in footprints.iter_mut().zip(tiles).enumerate() {
+            if tiles > 0 {
+                let i = shown.id(chunk * CHUNK + k);
+                let sh = &gaussians.sh()[i * coefficients..(i + 1) * coefficients];
+                footprint.color = if flat {
+                    sh[0].map(|value| (SH_OFFSET + SH_C0 * value).max(0.0))
+                } else {
+                    let mean = DVec3::from(gaussians.means()[i].map(f64::from));
+                    color(sh, mean - view.center)
+                };
+                brightest = footprint.color.into_iter().fold(brightest, f32::max);
             }
-        },
-    );
+        }
+        brightest
+    });
+    brightest.reduce(|| 0.0, f32::max)
 }
 
 /// Colour of harmonics `sh` (`[K, 3]`, 3DGS basis and order) seen along `toward` (any length).

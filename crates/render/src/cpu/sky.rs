@@ -69,7 +69,7 @@ impl<'a> Sky<'a> {
 fn atan2<S: Lanes>(simd: S, y: S::f32s, x: S::f32s) -> S::f32s {
     let number = |value: f64| simd.splat_f32s(value as f32);
     let zero = number(0.0);
-    let (wide, tall) = (simd.abs_f32s(x), simd.abs_f32s(y));
+    let (wide, tall) = (simd.abs(x), simd.abs(y));
     let long = simd.max_f32s(simd.max_f32s(wide, tall), simd.splat_f32s(f32::MIN_POSITIVE));
     let share = simd.div_f32s(simd.min_f32s(wide, tall), long);
     let square = simd.mul_f32s(share, share);

@@ -14,7 +14,8 @@ use super::{
 };
 use crate::{
     Frame, Labels, Samples,
-    constants::{HALF_LEVEL, TILE_SIZE},
+    budget::RayEnd,
+    constants::{HALF_LEVEL, TILE_SIZE, TRANSMITTANCE_MIN},
     labels::{BLEND_WIDTH, WeightRows, selected},
     levels::level,
 };
@@ -141,11 +142,18 @@ impl LaneKernel for Store<'_, '_> {
                 let alpha = simd.min_f32s(cell.alpha.at(simd, i), simd.splat_f32s(1.0));
                 cell.alpha.put(simd, i, alpha);
             }
+            let early = paint.ray_end.transmittance > TRANSMITTANCE_MIN;
+            if early {
+                cover(simd, cell, paint.ray_end);
+            }
             if paint.has_color() {
                 match &paint.behind {
                     Behind::Color(color) => over_color(simd, cell, color),
                     Behind::Sky(sky) => over_sky(simd, cell, tile, at, sky, paint.samples),
                 }
+            }
+            if early {
+                uncover(simd, cell);
             }
             for row in 0..rows {
                 let to = column + x..column + x + columns;
@@ -155,6 +163,33 @@ impl LaneKernel for Store<'_, '_> {
         if let Some(weights) = &mut out.weights {
             list(tile, column, scratch, weights);
         }
+    }
+}
+
+/// Puts the colour that is assumed behind rays that ended early where their light goes. Then they
+/// are opaque; their transmittance is what they had left, and that of all others is 0.
+#[inline(always)]
+fn cover<S: Lanes>(simd: S, cell: &mut Cell, end: RayEnd) {
+    let zero = simd.splat_f32s(0.0);
+    for i in 0..PIXELS / S::F32_LANES {
+        let left = cell.transmittance.at(simd, i);
+        let ended = simd.less_than_or_equal_f32s(left, simd.splat_f32s(end.transmittance));
+        let left = simd.select_f32s(ended, left, zero);
+        cell.transmittance.put(simd, i, left);
+        cell.alpha.put(simd, i, simd.add_f32s(cell.alpha.at(simd, i), left));
+        for sum in &mut cell.channels[..3] {
+            let covered = simd.fused(left, simd.splat_f32s(end.behind), sum.at(simd, i));
+            sum.put(simd, i, covered);
+        }
+    }
+}
+
+/// Takes back half of the opacity that [`cover`] gave: the middle of what may be behind.
+#[inline(always)]
+fn uncover<S: Lanes>(simd: S, cell: &mut Cell) {
+    for i in 0..PIXELS / S::F32_LANES {
+        let half = simd.mul_f32s(cell.transmittance.at(simd, i), simd.splat_f32s(0.5));
+        cell.alpha.put(simd, i, simd.sub_f32s(cell.alpha.at(simd, i), half));
     }
 }
 

@@ -21,6 +21,7 @@ use super::{
 use crate::{
     Frame, Labels, RenderRequest,
     backward::{FrameGradients, Gradients},
+    blocks::blocks_from,
     constants::ISECTS_MAX,
     error::{Error, ErrorCode, Result},
     options::{AdapterReport, RendererOptions},
@@ -82,12 +83,16 @@ impl Adapter {
     fn open_device(&self) -> Result<OpenDevice> {
         let gpu = Gpu::open(&self.adapter, &self.options.switches)?;
         let kernels = Kernels::compile(&gpu, &self.options.switches, self.report.software)?;
-        let scenes = SceneCache::new(self.options.scene_bytes_max);
+        let scenes = SceneCache::new(self.options.scene_bytes_max, self.blocks_from());
         Ok(OpenDevice { gpu, kernels: Arc::new(kernels), scenes: Arc::new(Mutex::new(scenes)) })
     }
 
     pub(super) fn report(&self) -> &AdapterReport {
         &self.report
+    }
+
+    fn blocks_from(&self) -> usize {
+        blocks_from(&self.options.switches)
     }
 
     fn isects_max(&self) -> u32 {
@@ -164,7 +169,7 @@ impl Adapter {
         if self.holds(gaussians.shape_identity()) {
             return Ok(());
         }
-        let scene = DeviceScene::upload(&on.gpu, gaussians, None)?;
+        let scene = DeviceScene::for_views(&on.gpu, gaussians, self.blocks_from())?;
         let mut scenes = on.scenes.lock();
         scenes.put(&on.gpu, scene);
         *self.shapes.lock() = scenes.shapes();

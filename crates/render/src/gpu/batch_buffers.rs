@@ -14,6 +14,8 @@ pub(super) struct BatchSizes {
     pub(super) views: u32,
     /// Gaussians of the scene.
     pub(super) count: u32,
+    /// Rows of its blocks; 0 without.
+    pub(super) rows: u32,
     /// Tile pairs of each view.
     pub(super) capacity: u32,
     /// Tiles of all views, and one more for each view.
@@ -33,6 +35,9 @@ pub(super) struct BatchBuffers {
     pub(super) views: wgpu::Buffer,
     pub(super) plans: wgpu::Buffer,
     pub(super) footprints: wgpu::Buffer,
+    /// Gaussians that cull leaves, of all views, and the workgroups of the stages that read them.
+    pub(super) rows: wgpu::Buffer,
+    pub(super) dispatch: wgpu::Buffer,
     /// Tiles that each Gaussian touches.
     pub(super) touched: wgpu::Buffer,
     /// Photos of all views.
@@ -108,8 +113,8 @@ impl BatchBuffers {
         }
     }
 
-    /// What the stages expect to be zeros: plans, and the counts of the tiles.
-    pub(super) fn zeros(&self) -> [&wgpu::Buffer; 2] {
-        [&self.plans, &self.ends]
+    /// What the stages expect to be zeros: plans, the counts of the tiles, and of workgroups.
+    pub(super) fn zeros(&self) -> [&wgpu::Buffer; 3] {
+        [&self.plans, &self.ends, &self.dispatch]
     }
 }

@@ -30,6 +30,8 @@ pub(super) struct Inputs<'a> {
     pub(super) views: u32,
     /// Gaussians of the scene.
     pub(super) count: u32,
+    /// Its blocks; 0: it has none.
+    pub(super) blocks: u32,
 }
 
 impl<'a> Inputs<'a> {
@@ -42,7 +44,18 @@ impl<'a> Inputs<'a> {
     ) -> Self {
         let flat = scene.is_some_and(|scene| kernels.flat(scene.sh_count));
         let count = scene.map_or(0, |scene| scene.count);
-        Self { room, scene, backward: None, training: None, earlier: None, flat, views, count }
+        let blocks = scene.map_or(0, DeviceScene::block_count);
+        Self {
+            room,
+            scene,
+            backward: None,
+            training: None,
+            earlier: None,
+            flat,
+            views,
+            count,
+            blocks,
+        }
     }
 }
 
@@ -67,6 +80,10 @@ macro_rules! bound {
 bound! { inputs;
     Nothing = return None;
     Views = &inputs.room.views;
+    Blocks = &inputs.scene?.blocks.as_ref()?.bounds;
+    Order = &inputs.scene?.blocks.as_ref()?.order;
+    Rows = &inputs.room.rows;
+    Dispatch = &inputs.room.dispatch;
     Gaussians = &inputs.scene?.gaussians;
     Sh = &inputs.scene?.sh;
     Entries = &inputs.scene?.labels.as_ref()?.entries;
@@ -100,15 +117,17 @@ bound! { inputs;
 #[rustfmt::skip]
 fn bound(kernel: Kernel) -> &'static [Bound] {
     use Bound::{
-        Backdrops, ByPictures, ByWindows, Colors, Earlier, Ends, Entries, Exposures, Footprints,
-        Gaussians, Gradients, Lists, Moments, Nothing, Pairs, Partials, Photos, Pictures, Plans,
-        Sh, Shaded, Slots, Sources, Starts, Sums, Table, Touched, Training, Views,
+        Backdrops, Blocks, ByPictures, ByWindows, Colors, Dispatch, Earlier, Ends, Entries,
+        Exposures, Footprints, Gaussians, Gradients, Lists, Moments, Nothing, Order, Pairs,
+        Partials, Photos, Pictures, Plans, Rows, Sh, Shaded, Slots, Sources, Starts, Sums, Table,
+        Touched, Training, Views,
     };
     match kernel {
-        Kernel::Project => &[Views, Gaussians, Footprints, Touched, Plans, Ends, Sources],
-        Kernel::Shade => &[Views, Gaussians, Sh, Touched, Shaded],
+        Kernel::Cull => &[Views, Blocks, Order, Plans, Rows, Dispatch],
+        Kernel::Project => &[Views, Gaussians, Footprints, Touched, Plans, Ends, Sources, Rows],
+        Kernel::Shade => &[Views, Gaussians, Sh, Touched, Shaded, Plans, Rows],
         Kernel::PrefixSum => &[Views, Plans, Starts, Ends],
-        Kernel::EmitIsects => &[Views, Plans, Footprints, Touched, Starts, Ends, Pairs],
+        Kernel::EmitIsects => &[Views, Plans, Footprints, Touched, Starts, Ends, Pairs, Rows],
         Kernel::TileSort => &[Views, Starts, Ends, Pairs, Lists],
         Kernel::Rasterize(kinds) => match kinds.labels {
             RasterLabels::None =>

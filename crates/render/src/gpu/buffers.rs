@@ -11,7 +11,9 @@ use super::{
 };
 use crate::{
     Background, Labels, RenderRequest, Samples, Source,
-    constants::{HALF_LEVEL, OWN_SIZE},
+    blocks::{Blocks, Bounds, Frustum},
+    budget::{Budget, RayEnd, brightest},
+    constants::{HALF_LEVEL, OWN_SIZE, TRANSMITTANCE_MIN},
     error::{Error, ErrorCode, Result},
     scene::Gaussians,
     view::View,
@@ -28,6 +30,7 @@ pub struct ViewRow {
     pub center: [f32; 4],
     pub center_low: [f32; 4],
     pub background: [f32; 4],
+    pub ray_end: [f32; 4],
     pub focal: [f32; 2],
     pub principal: [f32; 2],
     pub slope_min: [f32; 2],
@@ -67,6 +70,11 @@ pub struct ViewRow {
     pub ray_first: [f32; 4],
     pub ray_across: [f32; 4],
     pub ray_down: [f32; 4],
+    pub sides: [[f32; 4]; 4],
+    pub photos: [f32; 4],
+    pub photos_widen: f32,
+    pub block_count: u32,
+    pub rest: [u32; 2],
 }
 
 /// `Source` of the shaders.
@@ -83,6 +91,23 @@ impl From<&Source> for SourceRow {
     fn from(source: &Source) -> Self {
         let Source { center, axis, scale, behind } = *source;
         Self { center, scale, axis, behind: u32::from(behind) }
+    }
+}
+
+/// `Block` of the shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct BlockRow {
+    pub center: [f32; 3],
+    pub reach: f32,
+    pub half: [f32; 3],
+    pub rest: u32,
+}
+
+impl From<&Bounds> for BlockRow {
+    fn from(bounds: &Bounds) -> Self {
+        let Bounds { center, half, reach } = *bounds;
+        Self { center, reach, half, rest: 0 }
     }
 }
 
@@ -118,6 +143,7 @@ pub struct PlanRow {
     pub needed: u32,
     pub visible: u32,
     pub farthest: u32,
+    pub rows: u32,
 }
 
 /// `Training` of the shaders: a step of training.
@@ -135,7 +161,7 @@ pub struct TrainingRow {
     pub ssim_share: f32,
     pub photo: u32,
     pub photo_start: u32,
-    pub rest: u32,
+    pub blames: u32,
 }
 
 /// What `project_backward` writes of each Gaussian: [`GRADIENT_WORDS`] numbers.
@@ -172,6 +198,7 @@ impl ViewRow {
             center: row(high(view.center)),
             center_low: row(low(view.center)),
             background: [background[0], background[1], background[2], 0.0],
+            ray_end: [TRANSMITTANCE_MIN, 0.0, 0.0, 0.0],
             focal: narrow(view.focal),
             principal: narrow(view.principal),
             slope_min: narrow(view.slope_min),
@@ -197,13 +224,16 @@ impl ViewRow {
     }
 
     /// The row of a request, of which `view` is the camera. The caller sets also where the view's
-    /// photos, its table and its backdrop start.
-    pub fn of(view: &View, request: &RenderRequest) -> Self {
+    /// photos, its table and its backdrop start. Colours are at most `brightest`.
+    pub fn of(view: &View, request: &RenderRequest, brightest: f32) -> Self {
         let background = match &request.background {
             Background::Color(color) => *color,
             Background::Backdrop(_) => [0.0; 3],
         };
         let exact = request.samples == Samples::F32;
+        let frustum = Frustum::new(view, request);
+        let wide = |(v, w): (glam::DVec3, f64)| v.extend(w).as_vec4().to_array();
+        let ray_end = RayEnd::new(Budget::of(request).rays, request, brightest);
         let [first, across, down] = view.rays().map(|[x, y, z]| [x, y, z, 0.0]);
         Self {
             levels: match request.samples {
@@ -218,9 +248,13 @@ impl ViewRow {
             },
             own_focal: (view.focal[0].max(view.focal[1]) / f64::from(OWN_SIZE)) as f32,
             source_count: request.sources.len() as u32,
+            ray_end: [ray_end.transmittance, ray_end.behind, 0.0, 0.0],
             ray_first: first,
             ray_across: across,
             ray_down: down,
+            sides: frustum.sides.map(wide),
+            photos: wide(frustum.photos),
+            photos_widen: frustum.widens as f32,
             ..Self::new(view, background, request.antialiased)
         }
     }
@@ -234,12 +268,37 @@ pub(super) struct DeviceScene {
     pub(super) count: u32,
     /// Spherical harmonics of each Gaussian.
     pub(super) sh_count: u32,
+    /// A bound of their colours.
+    pub(super) brightest: f32,
     /// `[N]` of [`GaussianRow`].
     pub(super) gaussians: wgpu::Buffer,
     /// `[N, K, 3]` f32.
     pub(super) sh: wgpu::Buffer,
+    pub(super) blocks: Option<DeviceBlocks>,
     /// Uploaded when a request first asks for labels.
     pub(super) labels: Option<DeviceLabels>,
+}
+
+/// The blocks of a scene on the device.
+#[derive(Clone, Debug)]
+pub(super) struct DeviceBlocks {
+    count: u32,
+    /// Of [`BlockRow`].
+    pub(super) bounds: wgpu::Buffer,
+    /// `[N]` Gaussians, block after block.
+    pub(super) order: wgpu::Buffer,
+}
+
+impl DeviceBlocks {
+    fn upload(gpu: &Gpu, source: &Gaussians) -> Result<Self> {
+        let blocks = Blocks::of(source);
+        let rows: Vec<BlockRow> = blocks.bounds.iter().map(BlockRow::from).collect();
+        Ok(Self {
+            count: rows.len() as u32,
+            bounds: gpu.upload("blocks", bytemuck::cast_slice(&rows), None)?,
+            order: gpu.upload("order of blocks", bytemuck::cast_slice(&blocks.order), None)?,
+        })
+    }
 }
 
 /// Entries of the Gaussians on the device.
@@ -274,33 +333,71 @@ impl DeviceScene {
 
     fn size_bytes(&self) -> u64 {
         let labels = self.labels.as_ref().map_or(0, |labels| labels.entries.size());
-        self.gaussians.size() + self.sh.size() + labels
+        let blocks = self.blocks.as_ref().map_or(0, |blocks| blocks.order.size());
+        self.gaussians.size() + self.sh.size() + labels + blocks
     }
 
-    /// Uploads `source`, into the buffers of `old` where they have room.
+    /// Number of its blocks; 0 if it has none.
+    pub(super) fn block_count(&self) -> u32 {
+        self.blocks.as_ref().map_or(0, |blocks| blocks.count)
+    }
+
+    /// Uploads `source` for views, with blocks if it has `blocks_from` Gaussians or more.
+    /// Errors: as [`Self::upload`].
+    pub(super) fn for_views(gpu: &Gpu, source: &Gaussians, blocks_from: usize) -> Result<Self> {
+        let mut scene = Self::upload(gpu, source, None)?;
+        if source.len() >= blocks_from {
+            scene.blocks = Some(DeviceBlocks::upload(gpu, source)?);
+        }
+        Ok(scene)
+    }
+
+    /// Uploads `source` without blocks, into the buffers of `old` where they have room.
     /// Errors: `limit_exceeded` when it does not fit the adapter's limits or memory.
     pub(super) fn upload(gpu: &Gpu, source: &Gaussians, old: Option<Self>) -> Result<Self> {
         let (old_gaussians, old_sh) = old.map(|old| (old.gaussians, old.sh)).unzip();
-        let rows: Vec<GaussianRow> = (0..source.len())
-            .into_par_iter()
-            .with_min_len(1 << 14)
-            .map(|i| GaussianRow {
-                mean: source.means()[i],
-                opacity: source.opacities()[i],
-                quat: source.quats()[i],
-                scale: source.scales()[i],
-                source: source.source()[i].view.into(),
-            })
-            .collect();
+        let rows = rows_of(source);
         Ok(Self {
             shape: source.shape_identity(),
             count: narrow("gaussians", source.len())?,
             sh_count: source.sh_count() as u32,
+            brightest: brightest(source),
             gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows), old_gaussians)?,
             sh: gpu.upload("sh", bytemuck::cast_slice(source.sh()), old_sh)?,
+            blocks: None,
             labels: None,
         })
     }
+
+    /// Uploads `source` with so many places, those behind its Gaussians with opacity 0.
+    /// Errors: as [`Self::upload`].
+    pub(super) fn with_places(gpu: &Gpu, source: &Gaussians, places: usize) -> Result<Self> {
+        let (mut rows, mut sh) = (rows_of(source), source.sh().to_vec());
+        rows.resize(places, GaussianRow::zeroed());
+        sh.resize(places * source.sh_count(), [0.0; 3]);
+        Ok(Self {
+            shape: source.shape_identity(),
+            count: narrow("gaussians", places)?,
+            sh_count: source.sh_count() as u32,
+            brightest: brightest(source),
+            gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows), None)?,
+            sh: gpu.upload("sh", bytemuck::cast_slice(&sh), None)?,
+            blocks: None,
+            labels: None,
+        })
+    }
+}
+
+/// Gaussians as the shaders read them.
+fn rows_of(source: &Gaussians) -> Vec<GaussianRow> {
+    let row = |i: usize| GaussianRow {
+        mean: source.means()[i],
+        opacity: source.opacities()[i],
+        quat: source.quats()[i],
+        scale: source.scales()[i],
+        source: source.source()[i].view.into(),
+    };
+    (0..source.len()).into_par_iter().with_min_len(1 << 14).map(row).collect()
 }
 
 /// Scenes on the device, the most recently drawn last.
@@ -308,11 +405,13 @@ impl DeviceScene {
 pub(super) struct SceneCache {
     scenes: Vec<DeviceScene>,
     bytes_max: u64,
+    blocks_from: usize,
 }
 
 impl SceneCache {
-    pub(super) fn new(bytes_max: u64) -> Self {
-        Self { scenes: Vec::new(), bytes_max }
+    /// For `bytes_max` bytes of scenes, with blocks from so many Gaussians on.
+    pub(super) fn new(bytes_max: u64, blocks_from: usize) -> Self {
+        Self { scenes: Vec::new(), bytes_max, blocks_from }
     }
 
     /// The scene of `source`, uploaded once; if `labelled`, with the entries of `source`.
@@ -340,11 +439,11 @@ impl SceneCache {
 
     /// Uploads a scene. Others leave to make room, the least recently drawn first.
     fn upload(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<DeviceScene> {
-        let scene = match DeviceScene::upload(gpu, source, None) {
+        let scene = match DeviceScene::for_views(gpu, source, self.blocks_from) {
             // The other scenes may hold the memory: drop them and try once more.
             Err(error) if error.code() == ErrorCode::LimitExceeded && !self.scenes.is_empty() => {
                 self.clear(gpu);
-                DeviceScene::upload(gpu, source, None)?
+                DeviceScene::for_views(gpu, source, self.blocks_from)?
             }
             other => other?,
         };

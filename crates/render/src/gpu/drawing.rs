@@ -100,8 +100,9 @@ impl<'a> Drawing<'a> {
         scene: &DeviceScene,
     ) -> Result<Self> {
         let view = View::new(origin, request)?;
-        let mut row = ViewRow::of(&view, request);
+        let mut row = ViewRow::of(&view, request, scene.brightest);
         (row.gaussian_count, row.sh_count) = (scene.count, scene.sh_count);
+        row.block_count = scene.block_count();
         // The bands are appended.
         let frame = Frame::blank([view.width, view.height], request, 0);
         Ok(Self { row, request, frame, weights: Vec::new(), weights_max: 0 })

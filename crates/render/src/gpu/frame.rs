@@ -11,7 +11,7 @@ use super::{
     buffers::{DeviceScene, PlanRow, SourceRow, ViewRow},
     device::Gpu,
     drawing::{Drawing, Ended, Layout, ReadBack},
-    pipelines::{Kernels, NO_PICTURE, RasterKinds},
+    pipelines::{BLOCK, Kernels, NO_PICTURE, RasterKinds},
     profile::Marks,
     readback,
     recorder::Recorder,
@@ -140,11 +140,12 @@ impl Batch {
         [PLAN_BYTES * self.rows.len() as u64, self.words * 4, self.slot_words * 4]
     }
 
-    /// What the buffers must hold, of a scene of `count` Gaussians.
-    pub(super) fn sizes(&self, count: u32, shades: bool) -> BatchSizes {
+    /// What the buffers must hold for this scene.
+    pub(super) fn sizes(&self, scene: &DeviceScene, shades: bool) -> BatchSizes {
         BatchSizes {
             views: self.rows.len() as u32,
-            count,
+            count: scene.count,
+            rows: scene.block_count() * BLOCK,
             capacity: self.capacity,
             tiles: self.tiles,
             shades,
@@ -261,7 +262,7 @@ impl Tools<'_> {
         // All have the same.
         let kinds = RasterKinds::from(drawings[0].request);
         let shades = kinds.color && !self.kernels.flat(self.scene.sh_count);
-        let room = self.scratch.room(self.gpu, &batch.sizes(self.scene.count, shades))?;
+        let room = self.scratch.room(self.gpu, &batch.sizes(self.scene, shades))?;
         let parts = batch.read_bytes();
         self.submit(&room, batch, kinds)?;
         let ended = readback::read(self.gpu, &room.staging, parts.iter().sum(), |bytes| {

@@ -17,11 +17,12 @@ use super::{
     recorder::Recorder,
 };
 pub use super::{
-    buffers::{FootprintRow, GaussianRow, PlanRow, SourceRow, TrainingRow, ViewRow},
+    buffers::{BlockRow, FootprintRow, GaussianRow, PlanRow, SourceRow, TrainingRow, ViewRow},
     pipelines::{SHADERS, SHARED, Shader},
 };
 use crate::{
     RenderRequest,
+    budget::brightest,
     error::Result,
     scene::Gaussians,
     train::{Trainer as _, TrainingSet, TrainingStep},
@@ -291,7 +292,7 @@ fn scene_row(gaussians: &Gaussians, request: &RenderRequest) -> Result<ViewRow> 
     Ok(ViewRow {
         gaussian_count: narrow("gaussians", gaussians.len())?,
         sh_count: gaussians.sh_count() as u32,
-        ..ViewRow::of(&view, request)
+        ..ViewRow::of(&view, request, brightest(gaussians))
     })
 }
 

@@ -190,7 +190,7 @@ impl DifferentiableRenderer for GpuRenderer {
         Ok(Some(Box::new(self.adapter_for(set.gaussians).trainer(set, bytes_max)?)))
     }
 
-    fn slow_after_rest(&self) -> bool {
+    fn is_device(&self) -> bool {
         !self.adapter().software
     }
 }

@@ -16,6 +16,8 @@ use crate::{
 shared! { pub(super) u32;
     /// Invocations of a workgroup: WebGPU's portable floor, and the values of a radix digit.
     WORKGROUP_SIZE = 256;
+    /// Gaussians of a block.
+    BLOCK = crate::blocks::BLOCK as u32;
     /// Views that one submission draws at most.
     VIEWS_MAX = 8;
     /// Pairs of a tile that one workgroup sorts at once: 16 KiB, the portable floor.
@@ -82,11 +84,12 @@ macro_rules! shader {
 }
 
 /// Every shader, in the order of the stages.
-pub const SHADERS: [Shader; 15] = [
-    shader!("project", "project", "camera", "tiles"),
-    shader!("shade", "shade", "sh"),
+pub const SHADERS: [Shader; 16] = [
+    shader!("cull", "cull"),
+    shader!("project", "project", "rows", "camera", "tiles"),
+    shader!("shade", "shade", "rows", "sh"),
     shader!("prefix_sum", "prefix_sum", "sum_before"),
-    shader!("emit_isects", "emit_isects", "tiles"),
+    shader!("emit_isects", "emit_isects", "rows", "tiles"),
     shader!("tile_sort", "tile_sort"),
     shader!("rasterize", "rasterize", "parts", "backdrop", "labels_none"),
     shader!("rasterize_blend", "rasterize", "parts", "backdrop", "labels_entries", "labels_blend"),
@@ -110,6 +113,7 @@ pub const SHADERS: [Shader; 15] = [
 /// Kernels, in the order of the stages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(super) enum Kernel {
+    Cull,
     Project,
     Shade,
     PrefixSum,
@@ -185,6 +189,7 @@ impl Kernel {
     /// adapter.
     fn row(self) -> (&'static str, &'static str, [&'static str; 2]) {
         match self {
+            Self::Cull => ("cull", "cull", ["main"; 2]),
             Self::Project => ("project", "project", ["main"; 2]),
             Self::Shade => ("shade", "shade", ["main"; 2]),
             Self::PrefixSum => ("prefix_sum", "prefix_sum", ["main"; 2]),

@@ -14,6 +14,17 @@ use crate::{
 
 /// Workgroups that look for the farthest depth of a view.
 const FARTHEST_GROUPS: u32 = 64;
+/// Blocks that a workgroup of cull tests.
+const BLOCKS_TESTED: u32 = 8;
+
+/// Workgroups of a dispatch.
+#[derive(Clone, Copy)]
+enum Groups {
+    /// Along x and y, for each view.
+    Given([u32; 2]),
+    /// As cull says.
+    Left,
+}
 
 /// Records the stages of one batch of views into one compute pass.
 pub(super) struct Recorder<'a> {
@@ -69,7 +80,11 @@ impl<'a> Recorder<'a> {
     }
 
     /// Records one dispatch of `x` times `y` workgroups a view.
-    fn dispatch(&mut self, kernel: Kernel, [x, y]: [u32; 2]) {
+    fn dispatch(&mut self, kernel: Kernel, groups: [u32; 2]) {
+        self.record(kernel, Groups::Given(groups));
+    }
+
+    fn record(&mut self, kernel: Kernel, groups: Groups) {
         let pipeline = match self.kernels.get(self.gpu, kernel) {
             Ok(pipeline) => pipeline,
             Err(error) => {
@@ -81,7 +96,10 @@ impl<'a> Recorder<'a> {
         let Some(pass) = &mut self.pass else { return };
         pass.set_pipeline(&pipeline);
         pass.set_bind_group(0, group, &[]);
-        pass.dispatch_workgroups(x, y, self.inputs.views);
+        match groups {
+            Groups::Given([x, y]) => pass.dispatch_workgroups(x, y, self.inputs.views),
+            Groups::Left => pass.dispatch_workgroups_indirect(&self.inputs.room.dispatch, 0),
+        }
         if let Some(marks) = &mut self.marks {
             marks.mark(pass, kernel.name());
         }
@@ -98,6 +116,14 @@ impl<'a> Recorder<'a> {
         self.row(kernel, self.inputs.count);
     }
 
+    /// A stage with an invocation for each Gaussian that cull has left, if the scene has blocks.
+    fn shown(&mut self, kernel: Kernel) {
+        match self.inputs.blocks {
+            0 => self.gaussians(kernel),
+            _ => self.record(kernel, Groups::Left),
+        }
+    }
+
     /// A stage with a workgroup for each of `tiles` (columns, rows) of the largest view.
     pub(super) fn tiles(&mut self, kernel: Kernel, tiles: [u32; 2]) {
         self.dispatch(kernel, tiles);
@@ -110,12 +136,15 @@ impl<'a> Recorder<'a> {
 
     /// The stages of pictures of `kinds`, over `tiles` (columns, rows) of the largest view.
     pub(super) fn draw(&mut self, kinds: RasterKinds, tiles: [u32; 2]) {
-        self.gaussians(Kernel::Project);
+        if self.inputs.blocks > 0 {
+            self.dispatch(Kernel::Cull, split(self.inputs.blocks.div_ceil(BLOCKS_TESTED)));
+        }
+        self.shown(Kernel::Project);
         if kinds.color && !self.inputs.flat {
-            self.gaussians(Kernel::Shade);
+            self.shown(Kernel::Shade);
         }
         self.prefix_sum();
-        self.gaussians(Kernel::EmitIsects);
+        self.shown(Kernel::EmitIsects);
         self.tiles(Kernel::TileSort, tiles);
         self.tiles(Kernel::Rasterize(kinds), tiles);
     }
@@ -135,11 +164,13 @@ impl<'a> Recorder<'a> {
     }
 
     /// Compares the picture of one whole view of `tiles` (columns, rows) with its photo: what that
-    /// says of the picture, and the step of the photo's exposure.
-    pub(super) fn compare(&mut self, [columns, rows]: [u32; 2]) {
+    /// says of the picture, and, where it `moves`, the step of the photo's exposure.
+    pub(super) fn compare(&mut self, [columns, rows]: [u32; 2], moves: bool) {
         self.tiles(Kernel::LossWindows, [3 * columns, rows]);
         self.tiles(Kernel::PhotoLoss, [3 * columns, rows]);
-        self.dispatch(Kernel::Exposure, [1, 1]);
+        if moves {
+            self.dispatch(Kernel::Exposure, [1, 1]);
+        }
     }
 }
 

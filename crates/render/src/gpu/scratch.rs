@@ -18,6 +18,8 @@ pub(super) const WEIGHT_SLOTS_MIN: u32 = 8;
 const VIEW_BYTES: u64 = size_of::<ViewRow>() as u64 * VIEWS_MAX as u64;
 /// Bytes of a backdrop: a word for each cell.
 const BACKDROP_BYTES: u64 = 4 * (BACKDROP_WIDTH * BACKDROP_HEIGHT) as u64;
+/// Workgroups along x, y and z.
+const DISPATCH_BYTES: u64 = 12;
 const UNIFORM: BufferUsages = BufferUsages::UNIFORM.union(BufferUsages::COPY_DST);
 
 /// Buffers of earlier batches, and what the last views needed.
@@ -63,11 +65,13 @@ impl Scratch {
         let staging = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
         let views_buffer = sized("views", UNIFORM, VIEW_BYTES)?;
         let staging = sized("staging", staging, need.staging_bytes)?;
+        let dispatch = sized("dispatch", STORAGE | BufferUsages::INDIRECT, DISPATCH_BYTES)?;
         let mut storage = |label, size_bytes| sized(label, STORAGE, size_bytes);
         Ok(BatchBuffers {
             views: views_buffer,
             plans: storage("plans", views * size_of::<PlanRow>() as u64)?,
             footprints: storage("footprints", views * count * footprint_bytes)?,
+            rows: storage("rows", views * u64::from(need.rows) * 4)?,
             touched: storage("tiles of Gaussians", views * count * 4)?,
             sources: storage("photos", need.source_bytes)?,
             backdrops: storage("backdrops", BACKDROP_BYTES * u64::from(VIEWS_MAX))?,
@@ -79,6 +83,7 @@ impl Scratch {
             pictures: storage("pictures", need.picture_bytes)?,
             table: storage("label table", need.table_bytes)?,
             slots: storage("weight slots", need.slot_bytes)?,
+            dispatch,
             staging,
         })
     }

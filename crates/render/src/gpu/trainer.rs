@@ -25,8 +25,12 @@ use crate::{
     backward::backward_request,
     constants::TILE_SIZE,
     error::{Error, Result},
-    scene::{Gaussians, Photo},
-    train::{Exposure, Trainer, TrainingPhoto, TrainingSet, TrainingStep, absent, adam, checked},
+    scene::{Gaussians, Photo, RawGaussians},
+    train::{
+        Exposure, LearningRates, Trainer, TrainingPhoto, TrainingSet, TrainingStep, absent, adam,
+        checked,
+        growth::{Origins, halves, most_blamed},
+    },
 };
 
 const ROW_BYTES: u64 = size_of::<TrainingRow>() as u64;
@@ -48,7 +52,12 @@ pub(super) fn trainer_bytes(set: &TrainingSet<'_>) -> u64 {
     let each = 2 * row + learnt + PAIRS_A_GAUSSIAN * PAIR_BYTES;
     // Pictures, what the loss says of them, and SSIM's windows.
     let pictures = most * 4 * (4 + 4 + 9);
-    4 * set.photos.iter().map(pixels).sum::<u64>() + pictures + each * set.gaussians.len() as u64
+    4 * set.photos.iter().map(pixels).sum::<u64>() + pictures + each * places_of(set) as u64
+}
+
+/// Places for Gaussians that a trainer of `set` has.
+fn places_of(set: &TrainingSet<'_>) -> usize {
+    set.gaussians_max.max(set.gaussians.len())
 }
 
 /// Of `count` Gaussians with so many numbers of harmonics.
@@ -74,12 +83,16 @@ pub(super) struct DeviceTrainer {
     on: OpenDevice,
     isects_max: u32,
     scratch: Scratch,
-    /// As they came in.
-    start: Gaussians,
-    /// As they are now. One that was dropped has opacity 0.
+    origin: DVec3,
+    sh_degree: u8,
+    /// Of each place.
+    origins: Origins,
+    /// As they are now. A place without a Gaussian has opacity 0: one was dropped, or none came.
     scene: DeviceScene,
-    /// Rows and harmonics as they were when they were kept.
-    kept: Option<[wgpu::Buffer; 2]>,
+    /// Places from the first on, behind which none had a Gaussian yet.
+    used: usize,
+    /// As they were when they were kept.
+    kept: Option<Kept>,
     training: TrainingBuffers,
     /// Gradients of the photos before the last one of a step; there for steps of several.
     earlier: Option<wgpu::Buffer>,
@@ -93,6 +106,14 @@ pub(super) struct DeviceTrainer {
     pending: Option<Pending>,
 }
 
+/// Rows and harmonics of each place, and what came with them.
+#[derive(Clone, Debug)]
+struct Kept {
+    rows: wgpu::Buffer,
+    sh: wgpu::Buffer,
+    origins: Origins,
+}
+
 /// A submission whose plan is not here yet.
 #[derive(Debug)]
 struct Pending {
@@ -103,13 +124,14 @@ struct Pending {
 }
 
 /// What a submission does: the photo that it draws, the step, whether it adds what earlier photos
-/// say, and whether it moves the Gaussians.
+/// say, whether it moves the Gaussians, and whether it blames them in place of learning.
 #[derive(Clone, Copy, Debug)]
 struct PhotoStep {
     at: usize,
     step: TrainingStep,
     adds: bool,
     moves: bool,
+    blames: bool,
 }
 
 /// A photo's step as the device takes it.
@@ -121,6 +143,7 @@ struct DeviceStep<'a> {
     earlier: Option<&'a wgpu::Buffer>,
     adds: bool,
     moves: bool,
+    blames: bool,
     /// Where its plan goes.
     plan: &'a wgpu::Buffer,
 }
@@ -131,7 +154,8 @@ impl DeviceTrainer {
     /// its view.
     pub(super) fn new(on: OpenDevice, isects_max: u32, set: &TrainingSet<'_>) -> Result<Self> {
         set.check()?;
-        let (gpu, count) = (&on.gpu, set.gaussians.len() as u64);
+        let (gpu, places) = (&on.gpu, places_of(set));
+        let count = places as u64;
         // No step waits for a compiler.
         for kernel in Kernel::TRAINING {
             on.kernels.get(gpu, kernel)?;
@@ -166,7 +190,11 @@ impl DeviceTrainer {
         exposure[..3].fill(1.0);
         exposure[EXPOSURE_WORDS as usize - 1] = f32::NAN;
         let exposures = exposure.repeat(targets.len());
-        let scene = DeviceScene::upload(gpu, set.gaussians, None)?;
+        let scene = DeviceScene::with_places(gpu, set.gaussians, places)?;
+        let mut source = set.gaussians.source().to_vec();
+        let mut semantic_index = set.gaussians.semantic_index().to_vec();
+        source.resize_with(places, Default::default);
+        semantic_index.resize(places, 0);
         gpu.scoped("training", || {
             gpu.queue.write_buffer(&training.exposures, 0, bytemuck::cast_slice(&exposures));
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
@@ -176,8 +204,11 @@ impl DeviceTrainer {
         Ok(Self {
             isects_max,
             scratch: Scratch::default(),
-            start: set.gaussians.clone(),
+            origin: set.gaussians.origin(),
+            sh_degree: set.gaussians.sh_degree(),
+            origins: Origins { source, semantic_index },
             scene,
+            used: set.gaussians.len(),
             kept: None,
             training,
             earlier: None,
@@ -228,7 +259,7 @@ impl DeviceTrainer {
 
     /// Submits the step of a photo, and asks for its plan.
     fn submit(&mut self, photo_step: PhotoStep) -> Result<Pending> {
-        let PhotoStep { at, step, adds, moves } = photo_step;
+        let PhotoStep { at, step, adds, moves, blames } = photo_step;
         let target = self.targets.get(at).ok_or_else(|| absent(at))?.clone();
         let rates = &step.rates;
         let row = TrainingRow {
@@ -243,12 +274,12 @@ impl DeviceTrainer {
             ssim_share: self.ssim_share,
             photo: at as u32,
             photo_start: target.start,
-            ..TrainingRow::zeroed()
+            blames: blames.into(),
         };
         // That of the step before may still be under way in the other.
         self.plans.reverse();
         let (plan, training) = (self.plans[0].clone(), self.training.clone());
-        let (earlier, origin) = (self.earlier.clone(), self.start.origin());
+        let (earlier, origin) = (self.earlier.clone(), self.origin);
         let step = DeviceStep {
             request: &target.request,
             row,
@@ -256,6 +287,7 @@ impl DeviceTrainer {
             earlier: earlier.as_ref(),
             adds,
             moves,
+            blames,
             plan: &plan,
         };
         let mut tools = self.tools();
@@ -265,20 +297,20 @@ impl DeviceTrainer {
         Ok(Pending { photo_step, capacity, plan })
     }
 
-    /// Bytes of a buffer.
+    /// Buffers from a byte on, and how many bytes, one after another.
     fn read<T>(
         &mut self,
-        parts: &[(&wgpu::Buffer, u64)],
+        parts: &[(&wgpu::Buffer, u64, u64)],
         take: impl FnOnce(&[u8]) -> T,
     ) -> Result<T> {
         let gpu = &self.on.gpu;
-        let total = parts.iter().map(|part| part.1).sum::<u64>();
+        let total = parts.iter().map(|part| part.2).sum::<u64>();
         let staging = self.scratch.staging(gpu, total)?;
         gpu.scoped("training", || {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             let mut to = 0;
-            for (buffer, bytes) in parts {
-                encoder.copy_buffer_to_buffer(buffer, 0, &staging, to, Some(*bytes));
+            for (buffer, from, bytes) in parts {
+                encoder.copy_buffer_to_buffer(buffer, *from, &staging, to, Some(*bytes));
                 to += bytes;
             }
             gpu.queue.submit([encoder.finish()]);
@@ -286,37 +318,63 @@ impl DeviceTrainer {
         readback::read(gpu, &staging, total, take)
     }
 
-    /// Bytes of the rows and of the harmonics.
-    fn sizes(&self) -> [u64; 2] {
-        let count = self.start.len();
-        let rows = size_of::<GaussianRow>() * count;
-        [rows as u64, 12 * (count * self.start.sh_count()) as u64]
+    /// Bytes of the rows and of the harmonics of so many places.
+    fn sizes(&self, places: usize) -> [u64; 2] {
+        let (places, k) = (places as u64, u64::from(self.scene.sh_count));
+        [size_of::<GaussianRow>() as u64 * places, 12 * k * places]
     }
 
-    /// The Gaussians of buffers of rows and harmonics.
-    fn read_gaussians(&mut self, [rows, sh]: [wgpu::Buffer; 2]) -> Result<Gaussians> {
-        let sizes = self.sizes();
-        let row_bytes = size_of::<GaussianRow>() * self.start.len();
-        let parts = [(&rows, sizes[0]), (&sh, sizes[1])];
-        let mut raw = self.start.clone().into_raw();
-        self.read(&parts, |bytes| {
-            let (rows, sh) = bytes.split_at(row_bytes);
-            raw.sh.copy_from_slice(bytemuck::cast_slice(sh));
-            let rows: &[GaussianRow] = bytemuck::cast_slice(rows);
-            let out = raw.means.par_iter_mut().zip(&mut raw.quats).zip(&mut raw.scales);
-            let out = out.zip(&mut raw.opacities).zip(rows).with_min_len(1 << 14);
-            out.for_each(|((((mean, quat), scale), opacity), row)| {
-                (*mean, *quat, *scale) = (row.mean, row.quat, row.scale);
-                *opacity = row.opacity;
-            });
-        })?;
-        // Those that were dropped are under the smallest opacity.
-        let dropped = |opacity: &f32| *opacity < Gaussians::OPACITY_MIN;
-        let dropped: Vec<bool> = raw.opacities.iter().map(dropped).collect();
-        let raised = |opacity: &mut f32| *opacity = opacity.max(Gaussians::OPACITY_MIN);
-        raw.opacities.iter_mut().for_each(raised);
-        let all = checked(raw)?;
-        Ok(if dropped.contains(&true) { all.only(|i| !dropped[i]) } else { all })
+    /// Rows and harmonics of the places that are used.
+    fn read_places(&mut self, rows: &wgpu::Buffer, sh: &wgpu::Buffer) -> Result<Places> {
+        let [row_bytes, sh_bytes] = self.sizes(self.used);
+        self.read(&[(rows, 0, row_bytes), (sh, 0, sh_bytes)], |bytes| {
+            let (rows, sh) = bytes.split_at(row_bytes as usize);
+            (bytemuck::pod_collect_to_vec(rows), bytemuck::pod_collect_to_vec(sh))
+        })
+    }
+
+    /// The Gaussians of the places that have one.
+    fn read_gaussians(&mut self, Kept { rows, sh, origins }: &Kept) -> Result<Gaussians> {
+        let (rows, sh) = self.read_places(rows, sh)?;
+        let k = self.scene.sh_count as usize;
+        let there: Vec<usize> = (0..rows.len()).filter(|&i| is_there(&rows[i])).collect();
+        checked(RawGaussians {
+            origin: self.origin,
+            means: of_each(&there, |i| rows[i].mean),
+            quats: of_each(&there, |i| rows[i].quat),
+            scales: of_each(&there, |i| rows[i].scale),
+            opacities: of_each(&there, |i| rows[i].opacity),
+            sh_degree: self.sh_degree,
+            sh: there.iter().flat_map(|i| &sh[i * k..(i + 1) * k]).copied().collect(),
+            semantic_index: of_each(&there, |i| origins.semantic_index[i]),
+            source: of_each(&there, |i| origins.source[i]),
+        })
+    }
+
+    /// How much each place is to blame for how the scene differs from the photos.
+    fn blame(&mut self, photos: &[usize]) -> Result<Vec<f32>> {
+        let earlier = self.earlier()?;
+        // Nothing moves.
+        let rates = LearningRates::default().scaled(0.0);
+        let step = TrainingStep { rates, exposure: 0.0, opacity_min: 0.0 };
+        for (place, &at) in photos.iter().enumerate() {
+            self.take(PhotoStep { at, step, adds: place > 0, moves: false, blames: true })?;
+        }
+        let (count, k) = (u64::from(self.scene.count), self.scene.sh_count as usize);
+        let by_colours = (&earlier, gradient_bytes(count, 0), self.sizes(self.used)[1]);
+        self.read(&[by_colours], |bytes| {
+            let by: Vec<[f32; 3]> = bytemuck::pod_collect_to_vec(bytes);
+            by.par_chunks(k).with_min_len(1 << 12).map(|by| by[0].iter().sum()).collect()
+        })
+    }
+
+    /// Where the gradients of a photo are while those of the next are taken.
+    fn earlier(&mut self) -> Result<wgpu::Buffer> {
+        if self.earlier.is_none() {
+            let bytes = gradient_bytes(self.scene.count.into(), 3 * u64::from(self.scene.sh_count));
+            self.earlier = Some(self.on.gpu.create_buffer("earlier gradients", bytes, STORAGE)?);
+        }
+        self.earlier.clone().ok_or_else(|| Error::internal("training: no earlier gradients"))
     }
 
     /// What the loss says of the last picture, which photo `at` has the size of; `[H * W]`.
@@ -327,19 +385,19 @@ impl DeviceTrainer {
         let lens = target.request.lens();
         let bytes = 12 * u64::from(lens.width) * u64::from(lens.height);
         let by = self.scratch.backward_room(&self.on.gpu, [0; 3])?.by_pictures;
-        self.read(&[(&by, bytes)], bytemuck::pod_collect_to_vec)
+        self.read(&[(&by, 0, bytes)], bytemuck::pod_collect_to_vec)
     }
 }
 
 impl Trainer for DeviceTrainer {
     fn step(&mut self, photos: &[usize], step: &TrainingStep) -> Result<()> {
-        if photos.len() > 1 && self.earlier.is_none() {
-            let bytes = gradient_bytes(self.scene.count.into(), 3 * u64::from(self.scene.sh_count));
-            self.earlier = Some(self.on.gpu.create_buffer("earlier gradients", bytes, STORAGE)?);
+        if photos.len() > 1 {
+            self.earlier()?;
         }
         let step = *step;
         if let [at] = *photos {
-            let next = self.submit(PhotoStep { at, step, adds: false, moves: true })?;
+            let next =
+                self.submit(PhotoStep { at, step, adds: false, moves: true, blames: false })?;
             let Some(last) = self.pending.replace(next) else { return Ok(()) };
             let photo_step = last.photo_step;
             if !self.had_room(last)? {
@@ -351,14 +409,55 @@ impl Trainer for DeviceTrainer {
         // What the last photo moves needs what the others say.
         self.settle()?;
         for (place, &at) in photos.iter().enumerate() {
-            self.take(PhotoStep { at, step, adds: place > 0, moves: place + 1 == photos.len() })?;
+            let (adds, moves) = (place > 0, place + 1 == photos.len());
+            self.take(PhotoStep { at, step, adds, moves, blames: false })?;
         }
         Ok(())
     }
 
+    fn grow(&mut self, photos: &[usize], until: usize) -> Result<usize> {
+        self.settle()?;
+        let (now, k) = (self.scene.clone(), self.scene.sh_count as usize);
+        let (mut rows, mut sh) = self.read_places(&now.gaussians, &now.sh)?;
+        let mut free: Vec<usize> = (0..rows.len()).filter(|&i| !is_there(&rows[i])).collect();
+        let there = rows.len() - free.len();
+        free.extend(rows.len()..now.count as usize);
+        free.truncate(until.saturating_sub(there));
+        if free.is_empty() {
+            return Ok(there);
+        }
+        let parents = most_blamed(&self.blame(photos)?, free.len());
+        let free = &free[..parents.len()];
+        self.used = free.last().map_or(0, |last| last + 1).max(rows.len());
+        rows.resize(self.used, GaussianRow::zeroed());
+        sh.resize(self.used * k, [0.0; 3]);
+        let counts = (&self.training.moments.clone(), 0, 4 * self.used as u64);
+        let mut counts: Vec<f32> = self.read(&[counts], bytemuck::pod_collect_to_vec)?;
+        for (&i, &to) in parents.iter().zip(free) {
+            let [one, other] = halves(rows[i].mean, rows[i].quat, rows[i].scale);
+            (rows[i].mean, rows[i].scale) = one;
+            rows[to] = GaussianRow { mean: other.0, scale: other.1, ..rows[i] };
+            sh.copy_within(i * k..(i + 1) * k, to * k);
+            self.origins.source[to] = self.origins.source[i];
+            self.origins.semantic_index[to] = self.origins.semantic_index[i];
+            // New, says shaders/adam.wgsl.
+            (counts[i], counts[to]) = (-1.0, -1.0);
+        }
+        let gpu = &self.on.gpu;
+        gpu.scoped("training", || {
+            gpu.queue.write_buffer(&now.gaussians, 0, bytemuck::cast_slice(&rows));
+            gpu.queue.write_buffer(&now.sh, 0, bytemuck::cast_slice(&sh));
+            gpu.queue.write_buffer(&self.training.moments, 0, bytemuck::cast_slice(&counts));
+            gpu.queue.submit([]);
+        })?;
+        Ok(there + parents.len())
+    }
+
     fn render(&mut self, request: &RenderRequest) -> Result<Frame> {
         self.settle()?;
-        let mut drawing = Drawing::new(self.start.origin(), request, &self.scene)?;
+        // How bright its colours have become is not known here.
+        let request = &RenderRequest { error: 0.0, ..request.clone() };
+        let mut drawing = Drawing::new(self.origin, request, &self.scene)?;
         let rows = drawing.whole();
         self.tools().rows(&mut drawing, rows)?;
         drawing.finish(&mut self.scratch)
@@ -366,24 +465,26 @@ impl Trainer for DeviceTrainer {
 
     fn gaussians(&mut self) -> Result<Gaussians> {
         self.settle()?;
-        let now = [self.scene.gaussians.clone(), self.scene.sh.clone()];
-        self.read_gaussians(now)
+        let (rows, sh) = (self.scene.gaussians.clone(), self.scene.sh.clone());
+        self.read_gaussians(&Kept { rows, sh, origins: self.origins.clone() })
     }
 
     fn keep(&mut self) -> Result<()> {
         self.settle()?;
-        let (gpu, sizes) = (&self.on.gpu, self.sizes());
+        let places = self.scene.count as usize;
+        let (gpu, sizes, origins) = (&self.on.gpu, self.sizes(places), self.origins.clone());
         let kept = match self.kept.take() {
-            Some(kept) => kept,
-            None => [
-                gpu.create_buffer("kept rows", sizes[0], STORAGE)?,
-                gpu.create_buffer("kept harmonics", sizes[1], STORAGE)?,
-            ],
+            Some(kept) => Kept { origins, ..kept },
+            None => Kept {
+                rows: gpu.create_buffer("kept rows", sizes[0], STORAGE)?,
+                sh: gpu.create_buffer("kept harmonics", sizes[1], STORAGE)?,
+                origins,
+            },
         };
         gpu.scoped("training", || {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             let now = [&self.scene.gaussians, &self.scene.sh];
-            for ((from, to), bytes) in now.into_iter().zip(&kept).zip(sizes) {
+            for ((from, to), bytes) in now.into_iter().zip([&kept.rows, &kept.sh]).zip(sizes) {
                 encoder.copy_buffer_to_buffer(from, 0, to, 0, Some(bytes));
             }
             gpu.queue.submit([encoder.finish()]);
@@ -394,7 +495,7 @@ impl Trainer for DeviceTrainer {
 
     fn kept(&mut self) -> Result<Gaussians> {
         match self.kept.clone() {
-            Some(kept) => self.read_gaussians(kept),
+            Some(kept) => self.read_gaussians(&kept),
             None => self.gaussians(),
         }
     }
@@ -403,7 +504,7 @@ impl Trainer for DeviceTrainer {
         self.settle()?;
         let exposures = self.training.exposures.clone();
         let bytes = 4 * u64::from(EXPOSURE_WORDS) * self.targets.len() as u64;
-        self.read(&[(&exposures, bytes)], |bytes| {
+        self.read(&[(&exposures, 0, bytes)], |bytes| {
             let rows: &[[f32; EXPOSURE_WORDS as usize]] = bytemuck::cast_slice(bytes);
             let read = |row: &[f32; EXPOSURE_WORDS as usize]| {
                 let (gain, bias) = ([row[0], row[1], row[2]], [row[3], row[4], row[5]]);
@@ -412,6 +513,18 @@ impl Trainer for DeviceTrainer {
             rows.iter().map(read).collect()
         })
     }
+}
+
+/// Rows and harmonics of places.
+type Places = (Vec<GaussianRow>, Vec<[f32; 3]>);
+
+/// Whether a place has a Gaussian.
+fn is_there(row: &GaussianRow) -> bool {
+    row.opacity >= Gaussians::OPACITY_MIN
+}
+
+fn of_each<T: Send>(places: &[usize], of: impl Fn(usize) -> T + Sync + Send) -> Vec<T> {
+    places.par_iter().with_min_len(1 << 14).map(|&i| of(i)).collect()
 }
 
 /// Uploads the pixels of all photos, one after another.
@@ -443,7 +556,7 @@ impl Tools<'_> {
     /// Draws, compares, goes back and moves, in one submission of one view with room for `capacity`
     /// tile pairs. Where the plan says that it needs more, nothing is moved.
     fn train(&mut self, origin: DVec3, step: &DeviceStep<'_>, capacity: u32) -> Result<()> {
-        let DeviceStep { request, training, earlier, adds, moves, .. } = *step;
+        let DeviceStep { request, training, earlier, adds, moves, blames, .. } = *step;
         let (gpu, scene) = (self.gpu, self.scene);
         let drawing = Drawing::new(origin, request, scene)?;
         let (tiles, layouts) = (drawing.tiles(), [drawing.layout(drawing.whole(), 0)]);
@@ -453,7 +566,7 @@ impl Tools<'_> {
         // First, for both share a staging buffer, which this one needs the larger one of.
         let backward = self.scratch.backward_room(gpu, sizes)?;
         let batch = Batch::new(&[drawing], &layouts, capacity);
-        let sizes = batch.sizes(scene.count, !self.kernels.flat(scene.sh_count));
+        let sizes = batch.sizes(scene, !self.kernels.flat(scene.sh_count));
         let room = self.scratch.room(gpu, &BatchSizes { staging_bytes: 0, ..sizes })?;
         let held = std::mem::take(&mut self.scratch.backdrops);
         let inputs = Inputs {
@@ -465,10 +578,10 @@ impl Tools<'_> {
         gpu.scoped("training", || {
             batch.write(gpu, &room, &held);
             gpu.queue.write_buffer(&training.row, 0, bytemuck::bytes_of(&step.row));
-            let [plans, ends] = room.zeros();
+            let [plans, ends, _] = room.zeros();
             let mut stages = self.recorder(inputs, &[plans, ends, &backward.sums]);
             stages.draw(RasterKinds::from(request), tiles);
-            stages.compare(tiles);
+            stages.compare(tiles, !blames);
             stages.backward(Kinds::COLOR, tiles);
             if adds && earlier.is_some() {
                 stages.gaussians(Kernel::AddEarlier);

@@ -162,6 +162,17 @@ impl Adam {
         checked(raw)
     }
 
+    /// The Gaussians in these places have no moments any more, and as many come behind all.
+    pub(super) fn begin_anew(&mut self, places: &[usize]) {
+        for &i in places {
+            self.moments[i * self.width..][..self.width].fill(Moments::default());
+            self.counts[i] = 0;
+        }
+        let count = self.counts.len() + places.len();
+        self.moments.resize(count * self.width, Moments::default());
+        self.counts.resize(count, 0);
+    }
+
     /// Drops the Gaussians whose opacity is under `least`.
     pub(super) fn prune(&mut self, gaussians: &Gaussians, least: f32) -> Gaussians {
         let keep = |i: usize| gaussians.opacities()[i] >= least;

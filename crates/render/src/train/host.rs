@@ -3,7 +3,9 @@
 use rayon::prelude::*;
 
 use super::{
-    Exposure, PhotoLoss, Trainer, TrainingPhoto, TrainingSet, TrainingStep, absent, adam::Adam,
+    Exposure, PhotoLoss, Trainer, TrainingPhoto, TrainingSet, TrainingStep, absent,
+    adam::{Adam, checked},
+    growth::{halves, most_blamed},
     photo_loss, unit,
 };
 use crate::{
@@ -44,6 +46,18 @@ impl Target {
         by.par_iter_mut().for_each(|by| *by = std::array::from_fn(|c| by[c] * gain[c]));
         FrameGradients { color: Some(by), ..FrameGradients::default() }
     }
+
+    /// How far each number of a frame is from the photo.
+    fn differences(&self, frame: &Frame) -> FrameGradients {
+        let plain = frame.color.as_deref().unwrap_or_default();
+        let known = |i: usize| self.valid.as_ref().is_none_or(|valid| valid[i]);
+        let away = |(i, (color, photo)): (usize, (&[f32; 3], &[f32; 3]))| {
+            let shown = self.exposure.of(*color);
+            std::array::from_fn(|c| if known(i) { (shown[c] - photo[c]).abs() } else { 0.0 })
+        };
+        let away = plain.par_iter().zip(&self.rgb).enumerate().map(away).collect();
+        FrameGradients { color: Some(away), ..FrameGradients::default() }
+    }
 }
 
 /// A [`Trainer`] on the processor, over any renderer.
@@ -55,6 +69,7 @@ pub struct HostTrainer<'a> {
     adam: Adam,
     targets: Vec<Target>,
     ssim_share: f32,
+    gaussians_max: usize,
     /// Of a step, and of one of its photos.
     found: (Gradients, Gradients),
 }
@@ -73,6 +88,7 @@ impl<'a> HostTrainer<'a> {
             adam: Adam::new(set.gaussians),
             targets: set.photos.par_iter().map(Target::new).collect(),
             ssim_share: set.ssim_share,
+            gaussians_max: set.gaussians_max,
             found: Default::default(),
         })
     }
@@ -96,6 +112,41 @@ impl Trainer for HostTrainer<'_> {
             *gaussians = adam.prune(gaussians, step.opacity_min);
         }
         Ok(())
+    }
+
+    fn grow(&mut self, photos: &[usize], until: usize) -> Result<usize> {
+        let (count, k) = (self.gaussians.len(), self.gaussians.sh_count());
+        let more = until.min(self.gaussians_max).saturating_sub(count);
+        if more == 0 {
+            return Ok(count);
+        }
+        let Self { renderer, gaussians, targets, found: (found, _), .. } = self;
+        let mut blame = vec![0.0; count];
+        for &at in photos {
+            let target = targets.get(at).ok_or_else(|| absent(at))?;
+            let mut loss = |frame: &Frame| Ok(target.differences(frame));
+            renderer.backward(gaussians, &target.request, &mut loss, found)?;
+            let by_colour = found.sh.par_chunks(k).with_min_len(1 << 12);
+            blame.par_iter_mut().zip(by_colour).for_each(|(blame, by)| {
+                *blame += by[0].iter().sum::<f32>();
+            });
+        }
+        let parents = most_blamed(&blame, more);
+        let mut raw = std::mem::take(gaussians).into_raw();
+        for &i in &parents {
+            let [one, other] = halves(raw.means[i], raw.quats[i], raw.scales[i]);
+            (raw.means[i], raw.scales[i]) = one;
+            raw.means.push(other.0);
+            raw.scales.push(other.1);
+            raw.quats.push(raw.quats[i]);
+            raw.opacities.push(raw.opacities[i]);
+            raw.sh.extend_from_within(i * k..(i + 1) * k);
+            raw.semantic_index.push(raw.semantic_index[i]);
+            raw.source.push(raw.source[i]);
+        }
+        self.adam.begin_anew(&parents);
+        self.gaussians = checked(raw)?;
+        Ok(self.gaussians.len())
     }
 
     fn render(&mut self, request: &RenderRequest) -> Result<Frame> {

@@ -9,6 +9,7 @@
 
 pub mod adam;
 pub mod exposure;
+pub(crate) mod growth;
 mod host;
 pub mod photo_loss;
 
@@ -42,6 +43,8 @@ pub struct TrainingSet<'a> {
     pub photos: Vec<TrainingPhoto<'a>>,
     /// Share of SSIM in the loss, 0..1.
     pub ssim_share: f32,
+    /// Most Gaussians that [`Trainer::grow`] makes of them.
+    pub gaussians_max: usize,
 }
 
 impl TrainingSet<'_> {
@@ -84,13 +87,22 @@ pub trait Trainer {
     /// is not there. After an error the trainer is of no use.
     fn step(&mut self, photos: &[usize], step: &TrainingStep) -> Result<()>;
 
+    /// Makes two of each of those Gaussians that are most to blame for how the scene differs from
+    /// the photos of these numbers, until there are `until` or the most that the set allows. The
+    /// two lie side by side and inherit all else. Returns how many there are.
+    ///
+    /// # Errors
+    /// As [`Self::step`].
+    fn grow(&mut self, photos: &[usize], until: usize) -> Result<usize>;
+
     /// Draws the Gaussians as they are now.
     ///
     /// # Errors
     /// Those of [`crate::Renderer::render`].
     fn render(&mut self, request: &RenderRequest) -> Result<Frame>;
 
-    /// The Gaussians as they are now: those of the start that were not dropped, in their order.
+    /// The Gaussians as they are now: those of the start that were not dropped, in their order, and
+    /// those that came by [`Self::grow`], behind them or in the places of dropped ones.
     ///
     /// # Errors
     /// As [`Self::step`].

@@ -130,7 +130,7 @@ fn steps_are_those_of_pytorch() {
     let request = RenderRequest { kinds: Kinds::COLOR, ..request(camera(width, height)) };
     let photos = vec![TrainingPhoto { photo: &photo, request }];
     let given = Given::new();
-    let set = TrainingSet { gaussians: &start, photos, ssim_share: 0.2 };
+    let set = TrainingSet { gaussians: &start, photos, ssim_share: 0.2, gaussians_max: 0 };
     let mut trainer = HostTrainer::new(&given, &set).expect("a trainer");
     let rates = LearningRates {
         means: 1e-2,

@@ -7,7 +7,7 @@ use segsplat_core::{
     scene::{Gaussians, RawGaussians},
 };
 use segsplat_render::{
-    Background, Frame, Labels, Quality, RenderRequest, Renderer, Source, cpu::CpuRenderer,
+    Background, Frame, Labels, RenderRequest, Renderer, Source, cpu::CpuRenderer,
 };
 
 use crate::common::gpu;
@@ -98,8 +98,8 @@ fn fuzz(renderer: &dyn Renderer, iterations: u64) {
         }
         let near = [1e-30, 0.01, 1.0, 1e30][random.bits() as usize % 4];
         let antialiased = random.bits().is_multiple_of(2);
-        let quality = Quality::ALL[random.bits() as usize % 2];
-        let request = RenderRequest { near, antialiased, quality, ..request(camera) };
+        let error = [0.0, 2.0][random.bits() as usize % 2];
+        let request = RenderRequest { near, antialiased, error, ..request(camera) };
         let frame = renderer.render(&gaussians, &request).expect(&what);
         assert_clean(&frame, &what);
         fuzzed += count;

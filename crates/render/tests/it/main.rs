@@ -9,13 +9,15 @@
 
 mod adam;
 mod backward;
+mod blocks;
 #[path = "../common/mod.rs"]
 mod common;
 mod compare;
 mod compose;
 mod crop;
-mod fast;
+mod error;
 mod fuzz;
+mod growth;
 mod label_twins;
 mod labels;
 mod one_pass;

@@ -7,7 +7,8 @@ use naga::{Expression, Literal, Module, TypeInner};
 use segsplat_render::{
     constants,
     gpu::internals::{
-        self, FootprintRow, GaussianRow, PlanRow, SHADERS, Shader, SourceRow, TrainingRow, ViewRow,
+        self, BlockRow, FootprintRow, GaussianRow, PlanRow, SHADERS, Shader, SourceRow,
+        TrainingRow, ViewRow,
     },
 };
 
@@ -140,8 +141,14 @@ fn structs_lie_in_memory_as_the_shaders_say() {
                 ray_first,
                 ray_across,
                 ray_down,
+                sides,
+                photos,
+                photos_widen,
+                block_count,
+                rest,
             ]
         ),
+        layout!(BlockRow, "Block", [center, reach, half, rest]),
         layout!(GaussianRow, "Gaussian", [mean, opacity, quat, scale, source]),
         layout!(
             FootprintRow,
@@ -149,7 +156,7 @@ fn structs_lie_in_memory_as_the_shaders_say() {
             [mean, conic_shear, conic_x, conic_y, power_max, opacity, depth]
         ),
         layout!(SourceRow, "Source", [center, scale, axis, behind]),
-        layout!(PlanRow, "Plan", [isects, needed, visible, farthest]),
+        layout!(PlanRow, "Plan", [isects, needed, visible, farthest, rows]),
         layout!(
             TrainingRow,
             "Training",
@@ -165,7 +172,7 @@ fn structs_lie_in_memory_as_the_shaders_say() {
                 ssim_share,
                 photo,
                 photo_start,
-                rest,
+                blames,
             ]
         ),
     ];

@@ -53,7 +53,8 @@ fn same(skip: Skip, name: &str, mut got: Frame, want: &Frame) -> u64 {
 #[test]
 fn on_the_cpu_no_bit_changes() {
     let draw = |without, gaussians: &Gaussians, request: &RenderRequest| {
-        let cpu = CpuRenderer::with_switches(2, &Switches { without, ..Switches::default() });
+        let switches = Switches { without, blocks_min: Some(1), ..Switches::default() };
+        let cpu = CpuRenderer::with_switches(2, &switches);
         cpu.expect("two threads").render(gaussians, request).expect("a frame")
     };
     let mut boxed = 0;
@@ -70,13 +71,19 @@ fn on_the_cpu_no_bit_changes() {
 fn on_a_gpu_no_bit_changes() {
     let scenes = cases();
     for serial in [false, true] {
-        let Some(gpu) = open(|options| options.switches.serial = Some(serial)) else { return };
+        let Some(gpu) = open(|options| {
+            options.switches.serial = Some(serial);
+            options.switches.blocks_min = Some(1);
+        }) else {
+            return;
+        };
         let draw = |(_, gaussians, request): &(_, _, _)| gpu.render(gaussians, request);
         let wanted: Vec<_> = scenes.iter().map(|case| draw(case).expect("a frame")).collect();
         let mut boxed = 0;
         for skip in Skip::ALL {
             let Some(gpu) = open(|options| {
                 options.switches.serial = Some(serial);
+                options.switches.blocks_min = Some(1);
                 options.switches.without = Some(skip);
             }) else {
                 return;
@@ -91,7 +98,7 @@ fn on_a_gpu_no_bit_changes() {
 
 #[test]
 fn the_shaders_know_their_switches() {
-    for skip in Skip::ALL {
+    for skip in Skip::ALL.into_iter().filter(|skip| *skip != Skip::Blocks) {
         let name = skip.constant();
         // Declared, and asked for at least once.
         let used = SHADERS.iter().any(|shader| shader.source.matches(&name).count() > 1);
@@ -132,7 +139,7 @@ fn tile(footprints: &[Footprint], without: Option<Skip>) -> Vec<[f32; 3]> {
     let entries = vec![0; footprints.len()];
     let options = KernelOptions { without, ..KernelOptions::default() };
     let view = View::new(glam::DVec3::ZERO, &request).expect("a view");
-    let paint = Paint::new(&request, &view, &entries, options);
+    let paint = Paint::new(&request, &view, &entries, 0.0, options);
     let mut pairs: Vec<u64> = (0..footprints.len() as u64).collect();
     let mut color = vec![[9.0; 3]; 256];
     let mut out =

@@ -139,7 +139,7 @@ fn set<'a>(gaussians: &'a Gaussians, photos: &'a [(RenderRequest, Photo)]) -> Tr
         request: request.clone(),
     };
     let photos = photos.iter().map(photo).collect();
-    TrainingSet { gaussians, photos, ssim_share: SHARE }
+    TrainingSet { gaussians, photos, ssim_share: SHARE, gaussians_max: gaussians.len() }
 }
 
 fn step(opacity_min: f32) -> TrainingStep {

@@ -244,7 +244,8 @@ fn emit_isects_twin() {
         };
         let (tile_spans, tiles_per_gauss) = rows.clone().map(seen).unzip();
         let footprints = all.footprints.iter().map(to_footprint).collect();
-        let projected = Projected { footprints, tile_spans, tiles_per_gauss };
+        let projected =
+            Projected { footprints, tile_spans, tiles_per_gauss, ..Projected::default() };
         let order = depth_order(&projected);
         let (mut offsets, mut want) = (Vec::new(), Vec::new());
         let counts =
@@ -292,7 +293,7 @@ fn rasterize_twin() {
         tile_ranges::tile_ranges(&isects, grid.tile_count(), &mut ranges);
 
         let entries = gaussians.semantic_index();
-        let paint = Paint::new(&request, &view, entries, KernelOptions::default());
+        let paint = Paint::new(&request, &view, entries, 0.0, KernelOptions::default());
         let pixels = 96 * 96;
         let (mut color, mut depth, mut alpha) =
             (vec![[0.0; 3]; pixels], vec![0.0; pixels], vec![0.0; pixels]);

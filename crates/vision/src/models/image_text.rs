@@ -2,7 +2,7 @@
 
 use std::{
     collections::{BTreeMap, HashSet},
-    sync::Arc,
+    sync::{Arc, OnceLock},
 };
 
 use rayon::prelude::*;
@@ -35,7 +35,11 @@ pub struct ImageText {
     text: Network,
     tokenizer: Tokenizer,
     unknown: Option<u32>,
-    /// Words of the bundle's list of everyday words, single and in lower case.
+    /// Words of the bundle's list of everyday words that name things.
+    rivals: Vec<String>,
+    /// Their embeddings, after the first call that asks for them.
+    embedded: OnceLock<Arc<[Vec<f32>]>>,
+    /// The list's single words, in lower case.
     known: HashSet<String>,
     /// Crops a run of the image tower, where its file or a device fixes them.
     crops: Option<usize>,
@@ -123,6 +127,7 @@ impl ImageText {
             },
         };
         let text = Network::open(runtime, bundle, options, &spec)?;
+        let words: Vec<ListedWord> = bundle.words()?;
         Ok(Some(Self {
             // A device looks for its fastest kernels again at each new shape.
             crops: size(image.signature(), &manifest.image.input, 0)
@@ -130,7 +135,13 @@ impl ImageText {
             tokens: size(text.signature(), &manifest.text.input_ids, 1),
             texts: size(text.signature(), &manifest.text.input_ids, 0),
             unknown: tokenizer.token_to_id(&manifest.text.unknown),
-            known: known_words(bundle)?,
+            known: words
+                .iter()
+                .flat_map(|listed| listed.word.split_whitespace())
+                .map(str::to_lowercase)
+                .collect(),
+            rivals: words.into_iter().filter(|one| one.rival).map(|one| one.word).collect(),
+            embedded: OnceLock::new(),
             image,
             text,
             tokenizer: tokenizer.clone(),
@@ -183,6 +194,19 @@ impl ImageText {
     #[must_use]
     pub fn remark(&self) -> Option<String> {
         self.image.remark().or_else(|| self.text.remark())
+    }
+
+    /// Embeddings of the words of the bundle's list that name things; none where it has no list.
+    ///
+    /// # Errors
+    /// As [`Self::embed_texts`].
+    pub fn rivals(&self) -> Result<Arc<[Vec<f32>]>> {
+        if let Some(known) = self.embedded.get() {
+            return Ok(Arc::clone(known));
+        }
+        let rows = self.embed_texts(&self.rivals)?;
+        let made = rows.into_iter().map(|text| text.row).collect();
+        Ok(Arc::clone(self.embedded.get_or_init(|| made)))
     }
 
     /// `[crops * dim]`, rows of unit length; a row that has no length stays 0.
@@ -470,15 +494,17 @@ fn size(takes: &FileSignature, input: &str, axis: usize) -> Option<usize> {
     takes.get(input)?.shape.get(axis).copied().and_then(fixed)
 }
 
-/// The words of the list that the bundle measured, one by one.
-fn known_words(bundle: &Bundle) -> Result<HashSet<String>> {
-    #[derive(Deserialize)]
-    struct Row {
-        word: String,
-    }
-    let single =
-        |row: Row| -> Vec<String> { row.word.split_whitespace().map(str::to_lowercase).collect() };
-    Ok(bundle.words()?.into_iter().flat_map(single).collect())
+/// A row of the list of words that the bundle measured, as far as it is needed here.
+#[derive(Deserialize)]
+struct ListedWord {
+    word: String,
+    /// Whether it names a thing, as no colour does.
+    #[serde(default = "yes")]
+    rival: bool,
+}
+
+fn yes() -> bool {
+    true
 }
 
 /// The tokenizer's file, whose own truncation and padding are switched off: both are done here.

@@ -360,6 +360,9 @@ pub struct ImageTextManifest {
     /// By how much (difference of cosines); less than 0: it may also be a little under them.
     #[serde(default)]
     pub margin: f32,
+    /// Share of `words` that may fit an entry better than a text that selects it; 1: any.
+    #[serde(default = "defaults::rivals")]
+    pub rivals: f32,
     /// Coverage under which a pixel means nothing, 0..1.
     #[serde(default = "defaults::coverage_floor")]
     pub coverage_floor: f32,
@@ -521,6 +524,7 @@ mod defaults {
         crop_n_points_downscale_factor: u32 = 1_u32;
         min_area: f64 = 0.0005;
         coverage_floor: f32 = 0.05_f32;
+        rivals: f32 = 1.0_f32;
         batch: usize = 16_usize;
         tolerance: f64 = 2e-3;
         image_embeddings: String = "image_embeddings";
@@ -657,6 +661,7 @@ impl ImageTextManifest {
         }
         faults.range("image_text.coverage_floor", self.coverage_floor, 0.0..=1.0);
         faults.range("image_text.margin", self.margin, -2.0..=2.0);
+        faults.range("image_text.rivals", self.rivals, 0.0..=1.0);
         faults.range("image_text.image.crop_margin", image.crop_margin, 0.0..=4.0);
         faults.range("image_text.image.tolerance", image.tolerance, 0.0..=TOLERANCE_MAX);
         faults.range("image_text.image.batch", image.batch, 1..=BATCH_MAX);

@@ -31,6 +31,11 @@ use crate::{
 const AWAKE_EVERY: Duration = Duration::from_millis(4);
 const AWAKE_SIDE: u32 = 64;
 
+/// Longer side at which photos are learnt on a processor, pixels.
+const PROCESSOR_SIDE: u32 = 640;
+/// About what a Gaussian of degree 0 takes on a device, with moments, gradients and tile pairs.
+const DEVICE_BYTES_A_GAUSSIAN: u64 = 600;
+
 /// What a refinement came to.
 #[derive(Clone, Debug)]
 pub struct Refined {
@@ -68,35 +73,43 @@ pub fn refined(
     pace: &mut dyn FnMut(f32) -> Result<()>,
 ) -> Result<Refined> {
     let held = held_out(photos.len());
+    let options = &fitted(options, photos, renderer.is_device());
     let sized: Vec<PosedPhoto> = photos.iter().map(|photo| at_side(photo, options.side)).collect();
+    // The proof leaves room for the Gaussians of the photos that it lacks.
+    let share_of = |all: usize, held: &[usize]| {
+        all.saturating_mul(photos.len() - held.len()) / photos.len().max(1)
+    };
     // The scene without the photos `held`, and what its refinement begins with.
     let mut begin = |held: &[usize]| -> Result<(Scene, Gaussians)> {
         let (learnt, one_set) = awake(renderer, scene, || remake(split(photos, held).0))?;
         let (start, first) = start_of(scene, held, learnt, one_set)?;
-        // The proof leaves room for those of the photos that it lacks.
-        let all = options.gaussians_max.saturating_mul(photos.len() - held.len());
-        let gaussians_max = all / photos.len().max(1);
-        let gaussians = ready(&start, &first, &RefineOptions { gaussians_max, ..*options })?;
+        let gaussians_first = share_of(options.gaussians_first.min(options.gaussians_max), held);
+        let gaussians = ready(&start, &first, &RefineOptions { gaussians_first, ..*options })?;
         Ok((start, gaussians))
     };
-    let mut part = |start: (&Scene, &Gaussians), held: &[usize], budget, [begin, end]: [f32; 2]| {
+    let mut part = |start: (&Scene, &Gaussians),
+                    held: &[usize],
+                    options: &RefineOptions,
+                    [begin, end]: [f32; 2]| {
         let (learnt, held_out) = split(&sized, held);
         let mut pace = |spent: f32| pace(begin + (end - begin) * spent);
-        let options = RefineOptions { budget, ..*options };
-        refine::refine(renderer, start.0, start.1, &learnt, &held_out, &options, &mut pace)
+        refine::refine(renderer, start.0, start.1, &learnt, &held_out, options, &mut pace)
     };
     let RefineBudget { steps, time } = options.budget;
     if held.is_empty() {
         let (start, gaussians) = begin(&[])?;
         let budget = RefineBudget { steps: steps.min(UNWATCHED_STEPS_MAX), time };
-        let version = part((&start, &gaussians), &[], budget, [0.0, 1.0])?;
+        let options = RefineOptions { budget, ..*options };
+        let version = part((&start, &gaussians), &[], &options, [0.0, 1.0])?;
         let report = version.report.clone();
         return Ok(Refined { report, overfit: None, version: Some((start, version)) });
     }
     let share = options.proof_share.clamp(0.01, 0.99);
     let budget = RefineBudget { steps, time: of_time(time, share) };
     let (start, gaussians) = begin(&held)?;
-    let proof = part((&start, &gaussians), &held, budget, [0.0, share])?;
+    let gaussians_max = share_of(options.gaussians_max, &held);
+    let proof_options = RefineOptions { budget, gaussians_max, ..*options };
+    let proof = part((&start, &gaussians), &held, &proof_options, [0.0, share])?;
     let earlier = scene.meta.report.refinement.as_ref().and_then(|report| report.psnr_after);
     if proof.report.steps == 0 || proof.report.psnr_after <= earlier {
         return Ok(Refined { report: proof.report, overfit: None, version: None });
@@ -110,15 +123,24 @@ pub fn refined(
     let more = ((1.0 - share) / share).max(1.0);
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few steps")]
     let as_many = (proof.report.steps as f32 * more).round() as u32;
-    let budget = RefineBudget::steps(as_many.min(steps));
+    // All the time that is left, unless the proof became worse again.
+    let is_timed = time < Duration::MAX && !proof.is_peak;
+    let mut options = RefineOptions {
+        budget: RefineBudget {
+            steps: if is_timed { steps } else { as_many.min(steps) },
+            time: of_time(time, 1.0 - share),
+        },
+        ..*options
+    };
     let (start, mut gaussians) = begin(&[])?;
     if overfit <= f64::from(options.overfit_max) {
         let of_held = |i: usize| held.contains(&usize::from(gaussians.source()[i].view));
         let room = options.gaussians_max.saturating_sub(proof.gaussians.len());
         let more = fewer(&gaussians.only(of_held), room, options.seed)?;
         gaussians = proof.gaussians.joined(&more)?;
+        options.coarse_share = 0.0;
     }
-    let mut version = part((&start, &gaussians), &[], budget, [share, 1.0])?;
+    let mut version = part((&start, &gaussians), &[], &options, [share, 1.0])?;
     version.report = RefineReport {
         seconds: proof.report.seconds + version.report.seconds,
         psnr_before: proof.report.psnr_before,
@@ -129,9 +151,32 @@ pub fn refined(
     Ok(Refined { report, overfit: Some(overfit), version: Some((start, version)) })
 }
 
+/// The options with a side and a number of Gaussians for which there is time and room: a half of a
+/// device's bytes is for the photos and their smaller copies, a half for the Gaussians.
+fn fitted(options: &RefineOptions, photos: &[PosedPhoto], is_device: bool) -> RefineOptions {
+    if !is_device {
+        return RefineOptions { side: options.side.min(PROCESSOR_SIDE), ..*options };
+    }
+    let half = options.device_bytes_max / 2;
+    let pixels = |side: u32| -> f64 {
+        let of = |posed: &PosedPhoto| {
+            let [w, h] = [posed.photo.width, posed.photo.height].map(f64::from);
+            w * h * (f64::from(side) / w.max(h)).min(1.0).powi(2)
+        };
+        photos.iter().map(of).sum()
+    };
+    let bytes = |side: u32| 5.0 * pixels(side);
+    let mut side = options.side;
+    while side > PROCESSOR_SIDE && bytes(side) > half as f64 {
+        side = (side * 7 / 8).max(PROCESSOR_SIDE);
+    }
+    let room = usize::try_from(half / DEVICE_BYTES_A_GAUSSIAN).unwrap_or(usize::MAX);
+    RefineOptions { side, gaussians_max: options.gaussians_max.min(room.max(1)), ..*options }
+}
+
 /// Does `work`, and meanwhile draws a small view now and then, where a device would else rest.
 fn awake<T>(renderer: &dyn DifferentiableRenderer, scene: &Scene, work: impl FnOnce() -> T) -> T {
-    let Some(photo) = scene.meta.cameras.first().filter(|_| renderer.slow_after_rest()) else {
+    let Some(photo) = scene.meta.cameras.first().filter(|_| renderer.is_device()) else {
         return work();
     };
     let near = default_near(scene.meta.report.median_depth);

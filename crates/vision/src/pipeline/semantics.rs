@@ -106,8 +106,8 @@ impl Pipeline {
         let towers = self.image_text()?;
         let manifest = towers.manifest();
         let (tau, floor) = (f64::from(manifest.tau), f64::from(manifest.coverage_floor));
-        let margin = f64::from(manifest.margin);
-        Ok(ScoringMethod::of(preset, manifest.canon.clone(), tau, floor, margin))
+        let (margin, rivals) = (f64::from(manifest.margin), f64::from(manifest.rivals));
+        Ok(ScoringMethod::of(preset, manifest.canon.clone(), tau, floor, margin, rivals))
     }
 
     /// The same, ready to score.
@@ -116,8 +116,10 @@ impl Pipeline {
     /// `model_unavailable` when the bundle has no text tower, `internal` when it fails,
     /// `invalid_request` when a number is out of its bounds.
     pub fn scoring(&self, method: &ScoringMethod) -> Result<Scoring> {
-        let rows = self.image_text()?.embed_texts(&method.canon)?;
-        Scoring::new(method, rows.into_iter().map(|text| text.row).collect())
+        let towers = self.image_text()?;
+        let rows = towers.embed_texts(&method.canon)?;
+        let words = towers.rivals()?;
+        Scoring::new(method, rows.into_iter().map(|text| text.row).collect(), words)
     }
 }
 

@@ -3,7 +3,9 @@
 //! In: a scene and photos. Out: better Gaussians. The steps are those of
 //! [`segsplat_render::train`], on the renderer's device where that has room for them, else on the
 //! processor. A gain and a bias for each photo and channel take up its exposure. Gaussians that
-//! become transparent are dropped as it goes.
+//! become transparent are dropped as it goes, and others are split where the scene differs from the
+//! photos ([`segsplat_render::train::Trainer::grow`]). Large photos are learnt at half their size
+//! first.
 //!
 //! **Held out.** Of five photos and more, every eighth is held out ([`held_out`]): the steps never
 //! see it, and a version counts as better only where its PSNR on these photos is over that of the
@@ -32,7 +34,7 @@ pub use segsplat_render::train::LearningRates;
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Camera, Gaussians, PosedPhoto, RefineReport, Scene},
+    scene::{Camera, Gaussians, Intrinsics, Photo, PosedPhoto, RefineReport, Scene},
 };
 
 /// Fewest photos of which one is held out.
@@ -43,8 +45,13 @@ pub const HELD_OUT_EVERY: usize = 8;
 pub const UNWATCHED_STEPS_MAX: u32 = 30;
 /// Looks at the held-out photos in a whole budget.
 const LOOKS: u32 = 10;
-/// Looks without a better version after which it stops.
-const PATIENCE: u32 = 3;
+/// Shares of the budget between which Gaussians are added, steps between two times, what share of
+/// them comes each time, and photos that say where: docs/adr/0070.
+const GROWS_BETWEEN: [f32; 2] = [0.1, 0.7];
+const GROWS_EVERY: u32 = 100;
+const GROWTH_PHOTOS: usize = 4;
+/// Photos with a longer side under this have no smaller copies that come first.
+const COARSE_SIDE_MIN: u32 = 480;
 /// How far numbers move at first, `means` as a share of the median depth. 3DGS takes 30,000 steps
 /// that move less: docs/adr/0041.
 const RATES: LearningRates = LearningRates {
@@ -90,13 +97,25 @@ pub struct RefineOptions {
     pub budget: RefineBudget,
     /// Photos of a step.
     pub batch: usize,
-    /// Longer side at which the photos are learnt, pixels: what is learnt smaller than it is shown
-    /// has gaps.
+    /// Longer side at which the photos are learnt at most, pixels: what is learnt smaller than it
+    /// is shown has gaps.
     pub side: u32,
     /// How far numbers move; `means` as a share of the scene's median depth.
     pub rates: LearningRates,
     /// Most Gaussians to begin with: of more, this many are chosen at random and made wider.
+    pub gaussians_first: usize,
+    /// Most Gaussians for each pixel of a photo: as many are added where the scene differs from the
+    /// photos.
+    pub gaussians_a_pixel: f32,
+    /// Most Gaussians at all.
     pub gaussians_max: usize,
+    /// Share of the Gaussians that is added at a time; 0: none is, and none in the place of those
+    /// that are dropped.
+    pub growth: f32,
+    /// Share of the budget in which photos are learnt at half their size, 0..1.
+    pub coarse_share: f32,
+    /// Looks at the held-out photos without a better version after which it stops.
+    pub patience: u32,
     /// Gaussians under this opacity are dropped.
     pub opacity_min: f32,
     /// Steps between two times of dropping.
@@ -121,15 +140,20 @@ impl Default for RefineOptions {
         Self {
             budget: RefineBudget::steps(400),
             batch: 1,
-            side: 640,
+            side: 1_600,
             rates: RATES,
-            gaussians_max: 150_000,
+            gaussians_first: 150_000,
+            gaussians_a_pixel: 0.5,
+            gaussians_max: 1_000_000,
+            growth: 0.04,
+            coarse_share: 0.3,
+            patience: LOOKS,
             opacity_min: 0.01,
             prune_every: 50,
             ssim_share: 0.2,
             proof_share: 0.25,
             overfit_max: 1.5,
-            device_bytes_max: 1 << 30,
+            device_bytes_max: 2 << 30,
             seed: 1,
         }
     }
@@ -138,11 +162,13 @@ impl Default for RefineOptions {
 /// A version of a scene.
 #[derive(Clone, Debug)]
 pub struct RefinedVersion {
-    /// Its Gaussians: a part of those that came in, moved, in their order. Entries and sources came
-    /// with them.
+    /// Its Gaussians: those that came in, moved, less those that were dropped, and those that came
+    /// by growth. Entries and sources came with them.
     pub gaussians: Gaussians,
     /// How good it is; which photos are held out is for the caller to say.
     pub report: RefineReport,
+    /// Whether what came after it in the budget was worse.
+    pub is_peak: bool,
 }
 
 /// Numbers of the photos that are held out of `count`: the fourth and every eighth from there on,
@@ -255,6 +281,10 @@ struct Refinement<'a> {
     options: &'a RefineOptions,
     learnt: &'a [PosedPhoto],
     held_out: Vec<HeldOutPhoto>,
+    /// Whether the trainer has smaller copies of the photos behind them.
+    has_coarse: bool,
+    /// Gaussians that it begins with.
+    first: usize,
     report: RefineReport,
 }
 
@@ -265,7 +295,7 @@ struct Refinement<'a> {
 /// `internal` where they cannot be Gaussians any more.
 pub fn ready(start: &Scene, first: &Gaussians, options: &RefineOptions) -> Result<Gaussians> {
     let all = widened(start, first, Some(options.side))?;
-    fewer(&all, options.gaussians_max, options.seed)
+    fewer(&all, options.gaussians_first.min(options.gaussians_max), options.seed)
 }
 
 /// Refines `gaussians` on the photos that are learnt and watches the held-out ones. `start` is what
@@ -288,8 +318,9 @@ pub fn refine(
     options: &RefineOptions,
     pace: &mut dyn FnMut(f32) -> Result<()>,
 ) -> Result<RefinedVersion> {
-    if options.batch == 0 || options.prune_every == 0 || options.gaussians_max == 0 {
-        return Err(Error::invalid("refine: batch, prune_every and gaussians_max must be over 0"));
+    let over_0 = [options.gaussians_first, options.gaussians_max, options.batch];
+    if options.prune_every == 0 || over_0.contains(&0) {
+        return Err(Error::invalid("refine: batch, prune_every, gaussians_* must be over 0"));
     }
     let extent = start.meta.report.median_depth;
     let mut work = Refinement {
@@ -298,6 +329,8 @@ pub fn refine(
         options,
         learnt,
         held_out: held_out.par_iter().map(HeldOutPhoto::new).collect(),
+        has_coarse: false,
+        first: gaussians.len(),
         report: RefineReport::default(),
     };
     work.report = match &start.meta.report.refinement {
@@ -307,12 +340,15 @@ pub fn refine(
     if learnt.is_empty() || gaussians.is_empty() {
         return Ok(work.unrefined());
     }
-    let photos = learnt.iter().map(|posed| TrainingPhoto {
+    // Behind the photos their smaller copies.
+    let coarse = coarse_copies(learnt, options);
+    let photos = learnt.iter().chain(&coarse).map(|posed| TrainingPhoto {
         photo: &posed.photo,
         request: plain_view(start, posed.camera),
     });
-    let ssim_share = options.ssim_share;
-    let set = TrainingSet { gaussians, photos: photos.collect(), ssim_share };
+    work.has_coarse = !coarse.is_empty();
+    let (ssim_share, gaussians_max) = (options.ssim_share, most_gaussians(learnt, options));
+    let set = TrainingSet { gaussians, photos: photos.collect(), ssim_share, gaussians_max };
     #[expect(clippy::cast_possible_truncation, reason = "a length")]
     let extent = if extent.is_finite() && extent > 0.0 { extent as f32 } else { 1.0 };
     let rates = LearningRates { means: options.rates.means * extent, ..options.rates };
@@ -329,6 +365,50 @@ pub fn refine(
         Err(error) => return Err(error),
     }
     work.run(&mut HostTrainer::new(renderer, &set)?, &rates, pace)
+}
+
+/// The photos at half their size, where they are learnt so at first and are large enough.
+fn coarse_copies(photos: &[PosedPhoto], options: &RefineOptions) -> Vec<PosedPhoto> {
+    let longer = |posed: &PosedPhoto| posed.photo.width.max(posed.photo.height);
+    let least = photos.iter().map(longer).min().unwrap_or(0) / 2;
+    if options.coarse_share <= 0.0 || least < COARSE_SIDE_MIN {
+        return Vec::new();
+    }
+    photos.par_iter().map(halved).collect()
+}
+
+/// A photo of half the size: the mean of each two by two pixels. One is known where all four are.
+fn halved(posed: &PosedPhoto) -> PosedPhoto {
+    let (photo, lens) = (&posed.photo, posed.camera.intrinsics);
+    let (width, height) = (photo.width / 2, photo.height / 2);
+    let four = |i: usize| {
+        let (x, y) = (2 * (i % width as usize), 2 * (i / width as usize));
+        let at = y * photo.width as usize + x;
+        [at, at + 1, at + photo.width as usize, at + photo.width as usize + 1]
+    };
+    let mean = |i: usize| -> [u8; 3] {
+        let sum = |c: usize| four(i).iter().map(|at| u16::from(photo.rgb[3 * at + c])).sum::<u16>();
+        std::array::from_fn(|c| (sum(c) + 2).div_euclid(4) as u8)
+    };
+    let pixels = 0..width as usize * height as usize;
+    let rgb = pixels.clone().flat_map(mean).collect();
+    let known = |valid: &Vec<bool>| -> Vec<bool> {
+        pixels.map(|i| four(i).iter().all(|at| valid[*at])).collect()
+    };
+    let valid = photo.valid.as_ref().map(known);
+    let [fx, fy, cx, cy] = [lens.fx, lens.fy, lens.cx, lens.cy].map(|v| v / 2.0);
+    let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
+    let camera = Camera { intrinsics, ..posed.camera };
+    PosedPhoto { photo: Photo { width, height, rgb, valid }, camera, ..posed.clone() }
+}
+
+/// Most Gaussians that such photos can tell apart.
+fn most_gaussians(photos: &[PosedPhoto], options: &RefineOptions) -> usize {
+    let pixels = |posed: &PosedPhoto| posed.photo.width as usize * posed.photo.height as usize;
+    let most = photos.iter().map(pixels).max().unwrap_or(0);
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a number of them")]
+    let shown = (most as f32 * options.gaussians_a_pixel) as usize;
+    options.gaussians_max.min(shown.max(options.gaussians_first))
 }
 
 /// Whether a device was at fault.
@@ -349,8 +429,11 @@ impl Refinement<'_> {
         let watched = !self.held_out.is_empty();
         let few = !watched && self.learnt.len() < HOLDS_OUT_FROM;
         let mut best: Option<RefineReport> = None;
+        let mut is_peak;
         let (mut order, mut random) = (Vec::<usize>::new(), options.seed);
         let (mut steps, mut looked, mut waited, mut highest) = (0_u32, 0, 0, None);
+        let (mut grows_at, mut now, count) = (0, self.first, self.learnt.len());
+        let most = most_gaussians(self.learnt, options);
         loop {
             let spent = clock.spent(steps);
             let paused = Instant::now();
@@ -378,18 +461,31 @@ impl Refinement<'_> {
                     let served = self.report.clone();
                     best = Some(RefineReport { steps, seconds, psnr_after: after, ..served });
                 }
-                if last || waited >= PATIENCE {
+                is_peak = !better;
+                if last || waited >= options.patience {
                     break;
                 }
             }
-            let expected = steps as f32 / spent / self.learnt.len() as f32;
+            let coarse = self.has_coarse && spent < options.coarse_share;
+            let of_size = |i: usize| if coarse { count + i } else { i };
+            let [from, to] = GROWS_BETWEEN;
+            let grows = options.growth > 0.0 && (from..to).contains(&spent) && !few;
+            if grows && steps >= grows_at {
+                grows_at = steps + GROWS_EVERY;
+                let photos = shuffled(count, &mut random).into_iter().map(of_size);
+                let photos: Vec<usize> = photos.take(GROWTH_PHOTOS).collect();
+                now = trainer
+                    .grow(&photos, most.min(now + (now as f32 * options.growth) as usize))?;
+                tracing::debug!(steps, gaussians = now, "grown");
+            }
+            let expected = steps as f32 / spent / count as f32;
             let rate = LAST_RATE.powf(spent) * if few { 1.0 } else { rate_factor(expected) };
             let mut photos = Vec::with_capacity(options.batch);
             while photos.len() < options.batch {
                 if order.is_empty() {
-                    order = shuffled(self.learnt.len(), &mut random);
+                    order = shuffled(count, &mut random);
                 }
-                photos.extend(order.pop());
+                photos.extend(order.pop().map(of_size));
             }
             steps += 1;
             let prunes = steps.is_multiple_of(options.prune_every);
@@ -403,12 +499,16 @@ impl Refinement<'_> {
         let Some(report) = best else { return Ok(self.unrefined()) };
         let gaussians = trainer.kept()?;
         let report = RefineReport { gaussians_after: gaussians.len() as u64, ..report };
-        Ok(RefinedVersion { gaussians, report })
+        Ok(RefinedVersion { gaussians, report, is_peak })
     }
 
     /// The scene that came in.
     fn unrefined(&self) -> RefinedVersion {
-        RefinedVersion { gaussians: self.start.gaussians.clone(), report: self.report.clone() }
+        RefinedVersion {
+            gaussians: self.start.gaussians.clone(),
+            report: self.report.clone(),
+            is_peak: true,
+        }
     }
 
     /// The report of the scene before any step: as it is served, in layers where it has some.

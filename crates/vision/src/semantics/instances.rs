@@ -29,13 +29,16 @@ pub struct InstanceOptions {
     pub count_min: usize,
     /// Smallest share of all selected Gaussians that an instance may have.
     pub share_min: f64,
-    /// Share of an instance's Gaussians that a box leaves out on each side of each axis.
+    /// A box ends where its Gaussians get sparser, along an axis, than this share of the mean.
+    pub sparse: f64,
+    /// Share of those in between that a box leaves out on each side of each axis.
     pub trim: f64,
 }
 
 impl Default for InstanceOptions {
     fn default() -> Self {
-        Self { reach: 4.0, same_depth: 0.02, count_min: 12, share_min: 0.02, trim: 0.005 }
+        let (sparse, trim) = (0.05, 0.002);
+        Self { reach: 4.0, same_depth: 0.02, count_min: 12, share_min: 0.02, sparse, trim }
     }
 }
 
@@ -62,7 +65,9 @@ pub struct Instance {
     pub covariance: [[f64; 3]; 3],
     /// `[V]` share of its Gaussians that each photo shows, 0..1.
     pub visibility: Vec<f32>,
-    /// Centres, relative to `origin`.
+    /// Its entries, ascending, each with how many of its Gaussians have it.
+    pub entries: Vec<(u16, u32)>,
+    /// Centres that boxes hold, relative to `origin`: those of its solid middle.
     means: Vec<DVec3>,
     origin: DVec3,
     /// Up of the scene.
@@ -72,7 +77,17 @@ pub struct Instance {
 }
 
 impl Instance {
-    /// The box of the centres along the principal axes of the covariance, the longest first.
+    /// How well it fits a text, by the relevancy of each entry of the bank: that of its best entry,
+    /// of those that a tenth of its Gaussians have. So an edge of another entry does not count.
+    #[must_use]
+    pub fn score(&self, relevancies: &[f32]) -> f32 {
+        let total: u64 = self.entries.iter().map(|(_, count)| u64::from(*count)).sum();
+        let large = self.entries.iter().filter(|(_, count)| 10 * u64::from(*count) >= total);
+        let of = |(m, _): &(u16, u32)| relevancies.get(usize::from(*m)).copied().unwrap_or(0.0);
+        large.map(of).fold(0.0, f32::max)
+    }
+
+    /// The box along the principal axes of the covariance, the longest first.
     #[must_use]
     pub fn oriented(&self) -> Box3 {
         let spread = DMat3::from_cols_array_2d(&self.covariance);
@@ -80,16 +95,11 @@ impl Instance {
         boxed(longest_first(own), self.origin)
     }
 
-    /// The box of the centres that stands upright: its last axis is up, the others are the
-    /// principal axes of the covariance as seen from above, the longer first.
+    /// The box that stands upright, with the shortest way around it: its last axis is up, the
+    /// others lie level, the longer first.
     #[must_use]
     pub fn upright(&self) -> Box3 {
-        let spread = DMat3::from_cols_array_2d(&self.covariance);
-        let (a, b) = self.up.any_orthonormal_pair();
-        // Of a 2 x 2 matrix; 0 where no direction is longer.
-        let (aa, ab, bb) = (a.dot(spread * a), a.dot(spread * b), b.dot(spread * b));
-        let (sin, cos) = (0.5 * (2.0 * ab).atan2(aa - bb)).sin_cos();
-        let mut own = self.bounds([cos * a + sin * b, cos * b - sin * a, self.up]);
+        let mut own = self.bounds(upright_axes(&self.means, self.up));
         if length(&own[0]) < length(&own[1]) {
             own.swap(0, 1);
         }
@@ -101,7 +111,7 @@ impl Instance {
         boxed(own, self.origin)
     }
 
-    /// The box of the centres along the axes of the world.
+    /// The box along the axes of the world.
     #[must_use]
     pub fn aligned(&self) -> Box3 {
         boxed(self.bounds([DVec3::X, DVec3::Y, DVec3::Z]), self.origin)
@@ -109,14 +119,7 @@ impl Instance {
 
     /// Bounds along three axes. The share `trim` is left out on each side.
     fn bounds(&self, axes: [DVec3; 3]) -> Bounds {
-        axes.map(|axis| {
-            let mut along: Vec<f64> = self.means.iter().map(|mean| mean.dot(axis)).collect();
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share")]
-            let out = (self.trim.clamp(0.0, 0.49) * along.len() as f64) as usize;
-            let last = along.len() - 1 - out;
-            let least = *along.select_nth_unstable_by(out, f64::total_cmp).1;
-            (axis, [least, *along.select_nth_unstable_by(last, f64::total_cmp).1])
-        })
+        axes.map(|axis| (axis, quantiles(&self.means, axis, self.trim)))
     }
 }
 
@@ -217,10 +220,15 @@ impl Components {
         // Parts of one size are ordered by their first Gaussian, which is never shared.
         found
             .sort_by_key(|instance| (std::cmp::Reverse(instance.len()), instance.first().copied()));
-        found.into_iter().map(|found| self.described(gaussians, found, options.trim)).collect()
+        found.into_iter().map(|found| self.described(gaussians, found, options)).collect()
     }
 
-    fn described(&self, gaussians: &Gaussians, of: Vec<u32>, trim: f64) -> Instance {
+    fn described(
+        &self,
+        gaussians: &Gaussians,
+        of: Vec<u32>,
+        options: &InstanceOptions,
+    ) -> Instance {
         let means: Vec<DVec3> = of.iter().map(|&i| point(gaussians.means()[i as usize])).collect();
         let share = 1.0 / means.len() as f64;
         let middle = means.iter().sum::<DVec3>() * share;
@@ -236,15 +244,22 @@ impl Components {
         }
         #[expect(clippy::cast_possible_truncation, reason = "a share")]
         let visibility = shown.into_iter().map(|count| (f64::from(count) * share) as f32).collect();
+        let opacity = |i: &u32| f64::from(gaussians.opacities()[*i as usize]);
+        let weighted: Vec<Place> = means.into_iter().zip(of.iter().map(opacity)).collect();
+        let mut entries: Vec<u16> =
+            of.iter().map(|&i| gaussians.semantic_index()[i as usize]).collect();
+        entries.sort_unstable();
+        let count = |run: &[u16]| (run[0], u32::try_from(run.len()).unwrap_or(u32::MAX));
         let origin = gaussians.origin();
         Instance {
             centroid: (middle + origin).to_array(),
             covariance: (spread * share).to_cols_array_2d(),
             visibility,
-            means,
+            entries: entries.chunk_by(|a, b| a == b).map(count).collect(),
+            means: solid(weighted, self.up, options.sparse),
             origin,
             up: self.up,
-            trim,
+            trim: options.trim,
             gaussians: of,
         }
     }
@@ -381,6 +396,110 @@ fn seen(gaussians: &Gaussians, cameras: &[SceneCamera]) -> Vec<u64> {
         photos.for_each(|(v, _)| bits[v / 64] |= 1 << (v % 64));
     });
     bits
+}
+
+/// A centre and the opacity there.
+type Place = (DVec3, f64);
+
+/// Most places by which ends and axes are looked for; evenly spread over all.
+const SAMPLES: usize = 8192;
+/// Share of the places on each side that says nothing of the way around a box.
+const AROUND_TRIM: f64 = 0.01;
+
+/// The centres between the ends along the axes of the smallest upright box, found twice: the
+/// second time without what was beyond the ends.
+///
+/// A network puts some pixels of an edge between a thing and what is behind it, and masks take some
+/// pixels of that. So a few per cent of the Gaussians of a mug lie up to the wall.
+fn solid(mut places: Vec<Place>, up: DVec3, sparse: f64) -> Vec<DVec3> {
+    for _ in 0..2 {
+        let sample: Vec<Place> =
+            places.iter().step_by(places.len().div_ceil(SAMPLES).max(1)).copied().collect();
+        let centres: Vec<DVec3> = sample.iter().map(|(at, _)| *at).collect();
+        let axes = upright_axes(&centres, up);
+        let ends = axes.map(|axis| {
+            let along = sample.iter().map(|(at, opacity)| (at.dot(axis), *opacity));
+            ends(along.collect(), sparse)
+        });
+        let inside = |at: DVec3| {
+            let mut each = axes.iter().zip(ends);
+            each.all(|(axis, [from, to])| (from..=to).contains(&at.dot(*axis)))
+        };
+        places.retain(|(at, _)| inside(*at));
+    }
+    places.into_iter().map(|(at, _)| at).collect()
+}
+
+/// The two ends of places on a line, each with a weight: the part with the largest share of the
+/// weight, less `sparse` times its length. Lengths are in those of 80 % of the weight, as if all of
+/// it lay so. A far part is in it only where it holds more than what the way there costs.
+fn ends(mut along: Vec<(f64, f64)>, sparse: f64) -> [f64; 2] {
+    along.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let total: f64 = along.iter().map(|(_, weight)| weight).sum();
+    let at = |share: f64| {
+        let mut sum = 0.0;
+        let passes = |(_, weight): &&(f64, f64)| {
+            sum += weight;
+            sum >= share * total
+        };
+        along.iter().find(passes).or(along.last()).map_or(0.0, |(place, _)| *place)
+    };
+    let length = (at(0.9) - at(0.1)) / 0.8;
+    let all = along.first().zip(along.last()).map_or([0.0; 2], |(a, b)| [a.0, b.0]);
+    if length <= 0.0 || total <= 0.0 {
+        return all;
+    }
+    let (mut sum, mut least, mut from) = (0.0, f64::INFINITY, 0.0);
+    let (mut best, mut found) = (f64::NEG_INFINITY, all);
+    for (place, weight) in along {
+        let cost = sparse * place / length;
+        if sum - cost < least {
+            (least, from) = (sum - cost, place);
+        }
+        sum += weight / total;
+        if sum - cost - least > best {
+            (best, found) = (sum - cost - least, [from, place]);
+        }
+    }
+    found
+}
+
+/// Axes of the upright box with the shortest way around it; up is the last. Photos often see two
+/// sides of a thing, which the box that covers the least ground may lie across.
+fn upright_axes(centres: &[DVec3], up: DVec3) -> [DVec3; 3] {
+    let (a, b) = up.any_orthonormal_pair();
+    let every = centres.len().div_ceil(SAMPLES).max(1);
+    let sample: Vec<DVec3> = centres.iter().step_by(every).copied().collect();
+    let level = |degrees: f64| {
+        let (sin, cos) = degrees.to_radians().sin_cos();
+        [cos * a + sin * b, cos * b - sin * a]
+    };
+    let around = |degrees: f64| -> f64 {
+        let sides = level(degrees).map(|axis| quantiles(&sample, axis, AROUND_TRIM));
+        sides.map(|[from, to]| to - from).iter().sum()
+    };
+    let better = |best: (f64, f64), degrees: f64| {
+        let around = around(degrees);
+        if around < best.1 { (degrees, around) } else { best }
+    };
+    let coarse = (0..45).map(|step| f64::from(step) * 2.0);
+    let mut best = coarse.fold((0.0, f64::INFINITY), better);
+    for step in (0..8).map(|halved| f64::from(1 << halved).recip()) {
+        let near = [best.0 - step, best.0 + step];
+        best = near.into_iter().fold(best, better);
+    }
+    let [first, second] = level(best.0);
+    [first, second, up]
+}
+
+/// The places along an axis between which all but the share `trim` on each side lie.
+fn quantiles(centres: &[DVec3], axis: DVec3, trim: f64) -> [f64; 2] {
+    let mut along: Vec<f64> = centres.iter().map(|mean| mean.dot(axis)).collect();
+    let Some(end) = along.len().checked_sub(1) else { return [0.0; 2] };
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share")]
+    let out = (trim.clamp(0.0, 0.49) * along.len() as f64) as usize;
+    let least = *along.select_nth_unstable_by(out, f64::total_cmp).1;
+    [least, *along.select_nth_unstable_by(end - out, f64::total_cmp).1]
 }
 
 /// An axis, with the smallest and the largest place along it.

@@ -36,19 +36,29 @@ pub struct Scoring {
     margin: f64,
     /// Difference of cosines by which an entry may fit a text less than the best entry does.
     near_best: f64,
+    /// Embeddings of everyday words; empty where they do not count.
+    words: Arc<[Vec<f32>]>,
+    /// A text must fit an entry as well as the one of them that is at this place, from 1.
+    rivals: usize,
 }
 
 impl Scoring {
-    /// From the embeddings of the method's canonical texts, each of length 1.
+    /// From the embeddings of the method's canonical texts, and of the bundle's list of words,
+    /// which count where `rivals` is under 1; each of length 1.
     ///
     /// # Errors
     /// `invalid_request` when a number of the method is out of its bounds; `internal` when the
     /// embeddings are not those of its texts, differ in length, or have a number that is not
     /// finite.
-    pub fn new(method: &ScoringMethod, canon: Vec<Vec<f32>>) -> Result<Self> {
+    pub fn new(
+        method: &ScoringMethod,
+        canon: Vec<Vec<f32>>,
+        words: Arc<[Vec<f32>]>,
+    ) -> Result<Self> {
         method.check()?;
         let dim = canon.first().map_or(0, Vec::len);
-        let fit = canon.iter().all(|c| c.len() == dim && c.iter().all(|v| v.is_finite()));
+        let mut all = canon.iter().chain(&*words);
+        let fit = all.all(|c| c.len() == dim && c.iter().all(|v| v.is_finite()));
         if dim == 0 || canon.len() != method.canon.len() || !fit {
             return Err(Error::internal(format!(
                 "scoring: {} embeddings, not all of {dim} finite numbers, for {} canonical texts",
@@ -60,7 +70,10 @@ impl Scoring {
             *method;
         // Exactly 0 for a cut of 0.5.
         let margin = (cut / (1.0 - cut)).ln() / tau;
-        Ok(Self { unit_rows, canon, tau, coverage_floor, zero, margin, near_best })
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share")]
+        let rivals = ((method.rivals * words.len() as f64) as usize).max(1);
+        let words = if method.rivals < 1.0 { words } else { Arc::default() };
+        Ok(Self { unit_rows, canon, tau, coverage_floor, zero, margin, near_best, words, rivals })
     }
 
     /// A pixel with less coverage has relevancy 0.
@@ -219,8 +232,8 @@ pub struct Scorer {
     scoring: Arc<Scoring>,
     /// `[M]` lengths of the rows.
     norms: Arc<[f64]>,
-    /// Canonical phrase by row.
-    canon_scores: Vec<Vec<f64>>,
+    /// What a text is compared with, by row: see [`phrases`].
+    phrases: Vec<Vec<f64>>,
     /// Lower triangle of B B^T, row by row. The first call of [`Self::norms`] computes it.
     gram: OnceLock<Vec<f64>>,
 }
@@ -240,9 +253,9 @@ impl Scorer {
         }
         let rows = if scoring.unit_rows { unit_rows(bank) } else { bank.rows.clone() };
         let bank = Bank { dim, rows };
-        let norms = bank.rows.chunks_exact(dim).map(norm).collect();
-        let canon_scores = scoring.canon.iter().map(|c| scores(&bank, c)).collect();
-        Ok(Self { bank, scoring, norms, canon_scores, gram: OnceLock::new() })
+        let norms: Arc<[f64]> = bank.rows.chunks_exact(dim).map(norm).collect();
+        let phrases = phrases(&bank, &norms, &scoring);
+        Ok(Self { bank, scoring, norms, phrases, gram: OnceLock::new() })
     }
 
     /// How it scores.
@@ -275,10 +288,7 @@ impl Scorer {
                 self.bank.dim
             )));
         }
-        let mut own = scores(&self.bank, embedding);
-        own.iter_mut()
-            .zip(&*self.norms)
-            .for_each(|(score, norm)| *score -= self.scoring.zero * norm);
+        let own = scores(&self.bank, embedding);
         let group = |canon: &[Vec<f64>]| -> Vec<[f64; 4]> {
             let row = |m: usize| {
                 let [a, b, c] = [0, 1, 2].map(|g| own[m] - canon.get(g).unwrap_or(&canon[0])[m]);
@@ -287,11 +297,11 @@ impl Scorer {
             std::iter::once([0.0; 4]).chain((0..own.len()).map(row)).collect()
         };
         let nearer = |m: usize| {
-            let phrases = self.canon_scores.iter().take(u64::BITS as usize).enumerate();
+            let phrases = self.phrases.iter().take(u64::BITS as usize).enumerate();
             phrases.fold(0_u64, |bits, (c, canon)| bits | u64::from(own[m] < canon[m]) << c)
         };
         let mut text = TextScores {
-            groups: self.canon_scores.chunks(GROUP).map(group).collect(),
+            groups: self.phrases.chunks(GROUP).map(group).collect(),
             relevancies: vec![0.0],
             nearer: std::iter::once(u64::MAX).chain((0..own.len()).map(nearer)).collect(),
             norms: Arc::clone(&self.norms),
@@ -420,6 +430,29 @@ impl Scorer {
     }
 }
 
+/// What a text is compared with, `[M]` scores each: the canonical phrases with the margin. Where
+/// everyday words count: the best of the phrases for each row, and the word that is at the place of
+/// the last rival among those that fit the row best. So a text must be one of the words that fit
+/// best; of a hundred words that are not there, few are.
+fn phrases(bank: &Bank, norms: &[f64], scoring: &Scoring) -> Vec<Vec<f64>> {
+    let with_margin = |phrase: &Vec<f32>| -> Vec<f64> {
+        let own = scores(bank, phrase).into_iter().zip(norms);
+        own.map(|(score, norm)| score + scoring.zero * norm).collect()
+    };
+    let canon: Vec<Vec<f64>> = scoring.canon.iter().map(with_margin).collect();
+    if scoring.words.is_empty() {
+        return canon;
+    }
+    let best = |m: usize| canon.iter().map(|phrase| phrase[m]).fold(f64::NEG_INFINITY, f64::max);
+    let rival = |row: &[f32]| -> f64 {
+        let mut all: Vec<f64> = scoring.words.iter().map(|word| dot(row, word)).collect();
+        let at = all.len() - scoring.rivals.min(all.len());
+        *all.select_nth_unstable_by(at, f64::total_cmp).1
+    };
+    let rows = bank.rows.par_chunks_exact(bank.dim.max(1));
+    vec![(0..bank.len()).map(best).collect(), rows.map(rival).collect()]
+}
+
 /// `[M]` dot products of the rows with a vector.
 fn scores(bank: &Bank, with: &[f32]) -> Vec<f64> {
     bank.rows.chunks_exact(bank.dim.max(1)).map(|row| dot(row, with)).collect()
@@ -450,9 +483,10 @@ mod tests {
         let bank = Bank { dim: 2, rows: rows.concat() };
         let canon: Vec<[f32; 2]> = [3, 17, 31, 45, 59].map(around).to_vec();
         let canon = canon.iter().map(|c| c.to_vec()).collect();
-        let method = ScoringMethod::of(Preset::Paper, Vec::new(), 10.0, 0.05, 0.0);
+        let method = ScoringMethod::of(Preset::Paper, Vec::new(), 10.0, 0.05, 0.0, 1.0);
         let names = (0..5).map(|c: u8| c.to_string()).collect();
-        let scoring = Scoring::new(&ScoringMethod { canon: names, ..method }, canon).unwrap();
+        let method = ScoringMethod { canon: names, ..method };
+        let scoring = Scoring::new(&method, canon, Arc::default()).unwrap();
         let scorer = Scorer::new(&bank, Arc::new(scoring)).unwrap();
         let mut view = PixelWeights::none(0);
         for p in 0..400_u16 {

@@ -168,8 +168,8 @@ fn a_trimmed_box_forgets_a_stray() {
     // Joined to the patch by a thin chain of pixels.
     sites.extend(patch(0, 20..80, 10..11, 4.0));
     let scene = gaussians(&sites);
-    let whole = InstanceOptions { trim: 0.0, ..InstanceOptions::default() };
-    let trimmed = InstanceOptions { trim: 0.1, ..InstanceOptions::default() };
+    let whole = InstanceOptions { sparse: 0.0, trim: 0.0, ..InstanceOptions::default() };
+    let trimmed = InstanceOptions { trim: 0.1, ..whole };
     let width = |options: &InstanceOptions| {
         let found = instances(&scene, &cameras(1), options);
         assert_eq!(found.len(), 1);
@@ -177,6 +177,61 @@ fn a_trimmed_box_forgets_a_stray() {
     };
     assert!((width(&whole) - 79.0 * 0.04).abs() < 1e-4, "{}", width(&whole));
     assert!(width(&trimmed) < 40.0 * 0.04, "{}", width(&trimmed));
+}
+
+#[test]
+fn a_box_ends_where_its_gaussians_get_sparse() {
+    // A face of a box, and its edge's pixels that a network puts on the way to the wall behind.
+    let face = patch(0, 20..60, 20..60, 4.0);
+    let stray = |i: u16| {
+        let (mean, source) = patch(0, 60..61, 20 + i..21 + i, 4.0 + f64::from(i) * 0.07)[0];
+        (mean, source)
+    };
+    let strays: Vec<_> = (0..40).map(stray).collect();
+    let depth = |sites: &[(DVec3, SourcePixel)], sparse: f64| {
+        let options = InstanceOptions { same_depth: 0.1, sparse, ..InstanceOptions::default() };
+        let found = instances(&gaussians(sites), &cameras(1), &options);
+        assert_eq!((found.len(), found[0].gaussians.len()), (1, sites.len()));
+        let boxes = [found[0].oriented(), found[0].upright(), found[0].aligned()];
+        boxes.map(|held| held.size.into_iter().fold(0.0, f64::max))
+    };
+    let alone = depth(&face, 0.05);
+    let both = [face, strays].concat();
+    for (held, alone) in depth(&both, 0.05).into_iter().zip(alone) {
+        assert!((held - alone).abs() < 0.1 * alone, "{held}, alone {alone}");
+    }
+    for (held, alone) in depth(&both, 0.0).into_iter().zip(alone) {
+        assert!(held > 1.3 * alone, "{held}, alone {alone}");
+    }
+}
+
+#[test]
+fn an_upright_box_follows_two_sides_of_a_thing() {
+    // Two walls of a corner, as photos see a box: the longer 3, the other 2, turned by 25 degrees.
+    let turn = DMat3::from_rotation_y(25.0_f64.to_radians());
+    let grid = |i: usize| (i % 21, f64::from(u32::try_from(i / 21).unwrap()) * 0.1);
+    let long = |i| DVec3::new(grid(i).0 as f64 * 0.15, grid(i).1, 0.0);
+    let short = |i| DVec3::new(0.0, grid(i).1, grid(i).0 as f64 * 0.1);
+    let places = (0..210).map(long).chain((0..210).map(short));
+    let places: Vec<DVec3> = places.map(|at| turn * at + DVec3::Z * 6.0).collect();
+    let held = whole(&blobs(&places), &cameras(2)).upright();
+    let near = |a: [f64; 3], b: DVec3| (DVec3::from_array(a) - b).length() < 0.1;
+    assert!(near(held.size, DVec3::new(3.0, 2.0, 0.9)), "{held:?}");
+}
+
+#[test]
+fn the_score_of_a_part_is_that_of_an_entry_that_is_more_than_an_edge() {
+    let sites = patch(0, 0..40, 0..10, 4.0);
+    // Entry 3 has 12 of 400 Gaussians, entry 2 a quarter.
+    let entry = |i: usize| if i < 12 { 3 } else { 1 + u16::from(i.is_multiple_of(4)) };
+    let scene = gaussians(&sites).with_semantic_index((0..400).map(entry).collect()).unwrap();
+    let options = InstanceOptions::default();
+    let found =
+        Components::new(&scene, &cameras(1), &options).instances(&scene, &[1, 2, 3], &options);
+    assert_eq!(found.len(), 1);
+    assert_eq!(found[0].entries, [(1, 291), (2, 97), (3, 12)]);
+    assert_eq!(found[0].score(&[0.0, 0.6, 0.7, 0.9]), 0.7);
+    assert_eq!(found[0].score(&[]), 0.0);
 }
 
 /// A number of -0.5 to 0.5 that differs from one `i` to the next.
@@ -209,6 +264,7 @@ fn whole(of: &Gaussians, cameras: &[SceneCamera]) -> Instance {
         reach: 1e3,
         count_min: 1,
         share_min: 0.0,
+        sparse: 0.0,
         trim: 0.0,
         ..InstanceOptions::default()
     };

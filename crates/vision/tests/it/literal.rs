@@ -65,8 +65,9 @@ fn bank(m: u16, kind: Rows, random: &mut Random) -> Bank {
 
 fn scoring(preset: Preset, canon: &[Vec<f32>]) -> Scoring {
     let names: Vec<String> = (0..canon.len()).map(|c| c.to_string()).collect();
-    let method = ScoringMethod::of(preset, names.clone(), TAU, FLOOR, 0.0);
-    Scoring::new(&ScoringMethod { canon: names, ..method }, canon.to_vec()).expect("a scoring")
+    let method = ScoringMethod::of(preset, names.clone(), TAU, FLOOR, 0.0, 1.0);
+    Scoring::new(&ScoringMethod { canon: names, ..method }, canon.to_vec(), Arc::default())
+        .expect("a scoring")
 }
 
 /// What the plain definition gives for a pixel.

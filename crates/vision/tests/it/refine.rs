@@ -2,7 +2,7 @@
 
 use std::{
     sync::{
-        Arc,
+        Arc, Mutex,
         atomic::{AtomicUsize, Ordering},
     },
     thread,
@@ -100,11 +100,21 @@ fn refined(
     photos: &[PosedPhoto],
     steps: u32,
 ) -> RefinedVersion {
+    let budget = RefineBudget::steps(steps);
+    let options = RefineOptions { budget, growth: 0.0, ..RefineOptions::default() };
+    refined_by(renderer, start, photos, &options)
+}
+
+fn refined_by(
+    renderer: &dyn DifferentiableRenderer,
+    start: &Gaussians,
+    photos: &[PosedPhoto],
+    options: &RefineOptions,
+) -> RefinedVersion {
     let (learnt, out) = split(photos, &held_out(photos.len()));
-    let options = RefineOptions { budget: RefineBudget::steps(steps), ..RefineOptions::default() };
     let scene = scene(start, 3.0);
-    let gaussians = ready(&scene, start, &options).expect("Gaussians");
-    refine(renderer, &scene, &gaussians, &learnt, &out, &options, &mut |_| Ok(())).expect("refined")
+    let gaussians = ready(&scene, start, options).expect("Gaussians");
+    refine(renderer, &scene, &gaussians, &learnt, &out, options, &mut |_| Ok(())).expect("refined")
 }
 
 fn cpu() -> CpuRenderer {
@@ -168,10 +178,92 @@ fn refined_whole(
         Ok((made, one_set))
     };
     let budget = RefineBudget::steps(30);
-    let options = RefineOptions { budget, overfit_max, gaussians_max, ..RefineOptions::default() };
+    let options = RefineOptions {
+        budget,
+        overfit_max,
+        gaussians_max,
+        growth: 0.0,
+        ..RefineOptions::default()
+    };
     let pace = &mut |_: f32| Ok(());
     let found = refinement::refined(renderer, &scene, photos, &options, &mut remake, pace);
     (scene, found.expect("refined"))
+}
+
+#[test]
+fn gaussians_are_added_where_the_scene_differs_from_the_photos() {
+    let (truth, photos) = captured(9);
+    let start = disturbed(&truth).only(|i| i % 4 == 0);
+    let with = |growth: f32, gaussians_max: usize| {
+        let budget = RefineBudget::steps(400);
+        let options = RefineOptions { budget, growth, gaussians_max, ..RefineOptions::default() };
+        let best = refined_by(&cpu(), &start, &photos, &options);
+        (best.report.psnr_after.expect("held-out photos"), best.gaussians)
+    };
+    let ((plain, as_many), (better, more)) = (with(0.0, usize::MAX), with(0.3, usize::MAX));
+    println!("{plain:.2} dB with {}, {better:.2} dB with {}", as_many.len(), more.len());
+    assert!(as_many.len() <= start.len() && more.len() > start.len() * 3 / 2, "{}", more.len());
+    assert!(better > plain + 0.5, "{better} dB with more Gaussians, {plain} with as many");
+    let entries = start.semantic_index();
+    assert!(more.semantic_index().iter().all(|entry| entries.contains(entry)), "inherited");
+    let (_, bound) = with(0.3, start.len() + 7);
+    assert!(bound.len() <= start.len() + 7, "{} over the most", bound.len());
+}
+
+/// A renderer that says how wide the views are that it goes back from, and their focal length.
+struct Widths(CpuRenderer, Mutex<Vec<(u32, f64)>>);
+
+impl Renderer for Widths {
+    fn name(&self) -> String {
+        self.0.name()
+    }
+
+    fn concurrency(&self) -> usize {
+        self.0.concurrency()
+    }
+
+    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        self.0.render(gaussians, request)
+    }
+}
+
+impl DifferentiableRenderer for Widths {
+    fn backward(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
+        gradients: &mut Gradients,
+    ) -> Result<Frame> {
+        let lens = request.lens();
+        self.1.lock().expect("a lock").push((lens.width, lens.fx));
+        self.0.backward(gaussians, request, loss, gradients)
+    }
+}
+
+#[test]
+fn large_photos_are_learnt_at_half_their_size_first() {
+    let (truth, mut photos) = captured(5);
+    for posed in &mut photos {
+        let camera = Camera { intrinsics: camera(960, 24).intrinsics, ..posed.camera };
+        let rgb = vec![90; 3 * 960 * 24];
+        let photo = Photo { width: 960, height: 24, rgb, valid: None };
+        *posed = PosedPhoto { photo, camera, ..posed.clone() };
+    }
+    let widths = |coarse_share: f32, photos: &[PosedPhoto]| {
+        let renderer = Widths(cpu(), Mutex::default());
+        let budget = RefineBudget::steps(20);
+        let options = RefineOptions { budget, coarse_share, growth: 0.0, ..Default::default() };
+        refined_by(&renderer, &truth, photos, &options);
+        renderer.1.into_inner().expect("a lock")
+    };
+    let found = widths(0.3, &photos);
+    let focal = photos[0].camera.intrinsics.fx;
+    assert_eq!((&found[..6], &found[6..]), (&[(480, focal / 2.0); 6][..], &[(960, focal); 14][..]));
+    assert_eq!(widths(0.0, &photos), [(960, focal); 20]);
+    let (_, small) = captured(5);
+    let focal = small[0].camera.intrinsics.fx;
+    assert_eq!(widths(0.3, &small), [(48, focal); 20], "small photos have no smaller copies");
 }
 
 #[test]
@@ -263,7 +355,7 @@ impl DifferentiableRenderer for Resting {
         self.cpu.backward(gaussians, request, loss, gradients)
     }
 
-    fn slow_after_rest(&self) -> bool {
+    fn is_device(&self) -> bool {
         self.rests
     }
 }

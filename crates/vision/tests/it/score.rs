@@ -18,17 +18,18 @@ fn scoring(profile: Preset, canon: &[[f32; 2]]) -> Arc<Scoring> {
 
 fn new(preset: Preset, canon: Vec<Vec<f32>>, tau: f64, floor: f64) -> Result<Scoring> {
     let names: Vec<String> = (0..canon.len()).map(|c| c.to_string()).collect();
-    let method = ScoringMethod::of(preset, names.clone(), tau, floor, 0.0);
-    Scoring::new(&ScoringMethod { canon: names, tau, ..method }, canon)
+    let method = ScoringMethod::of(preset, names.clone(), tau, floor, 0.0, 1.0);
+    Scoring::new(&ScoringMethod { canon: names, tau, ..method }, canon, Arc::default())
 }
 
 /// The default, where no entry is left out for being far under the best one.
 fn all_over_the_canon(canon: &[[f32; 2]]) -> Arc<Scoring> {
     let names: Vec<String> = (0..canon.len()).map(|c| c.to_string()).collect();
     let near_best = ScoringMethod::NEAR_BEST_MAX;
-    let method = ScoringMethod::of(Preset::Default, names, 10.0, 0.05, 0.0);
+    let method = ScoringMethod::of(Preset::Default, names, 10.0, 0.05, 0.0, 1.0);
     let canon = canon.iter().map(|c| c.to_vec()).collect();
-    Arc::new(Scoring::new(&ScoringMethod { near_best, ..method }, canon).unwrap())
+    let method = ScoringMethod { near_best, ..method };
+    Arc::new(Scoring::new(&method, canon, Arc::default()).unwrap())
 }
 
 const X: [f32; 2] = [1.0, 0.0];
@@ -217,9 +218,9 @@ fn a_cut_selects_from_its_relevancy_on_and_no_less() {
     let bank = Bank { dim: 2, rows: [X, [0.6, 0.8], Y].concat() };
     let view = view(&[&[(1, 0.5)], &[(2, 0.9)], &[(1, 0.2), (2, 0.3)], &[(3, 0.7)], &[]]);
     let with = |cut: f64| {
-        let method = ScoringMethod::of(Preset::Paper, Vec::new(), 10.0, 0.0, 0.0);
+        let method = ScoringMethod::of(Preset::Paper, Vec::new(), 10.0, 0.0, 0.0, 1.0);
         let method = ScoringMethod { canon: vec!["y".to_owned()], cut, ..method };
-        let scoring = Arc::new(Scoring::new(&method, vec![Y.to_vec()]).unwrap());
+        let scoring = Arc::new(Scoring::new(&method, vec![Y.to_vec()], Arc::default()).unwrap());
         let scorer = Scorer::new(&bank, scoring).unwrap();
         let text = scorer.text(&X).unwrap();
         let map = scorer.relevancy(&text, &view, &scorer.norms(&view).unwrap()).unwrap();
@@ -268,10 +269,13 @@ fn a_margin_moves_what_counts_as_the_canon_in_tables_masks_and_relevancies_alike
     let bank = Bank { dim: 2, rows: rows.map(|row| row.map(|v| 3.0 * v)).concat() };
     let selected = |margin: f64| {
         let names = vec!["y".to_owned()];
-        let method = ScoringMethod::of(Preset::Default, names, 10.0, 0.05, margin);
+        let method = ScoringMethod::of(Preset::Default, names, 10.0, 0.05, margin, 1.0);
         let method = ScoringMethod { near_best: 2.0, ..method };
-        let scorer =
-            Scorer::new(&bank, Scoring::new(&method, vec![Y.to_vec()]).unwrap().into()).unwrap();
+        let scorer = Scorer::new(
+            &bank,
+            Scoring::new(&method, vec![Y.to_vec()], Arc::default()).unwrap().into(),
+        )
+        .unwrap();
         let text = scorer.text(&X).unwrap();
         let pixels = view(&[&[(1, 0.9)], &[(2, 0.9)], &[(3, 0.9)], &[(1, 0.5), (3, 0.4)]]);
         let norms = scorer.norms(&pixels).unwrap();
@@ -291,4 +295,36 @@ fn a_margin_moves_what_counts_as_the_canon_in_tables_masks_and_relevancies_alike
     assert_eq!(strict, [true, false, false, false]);
     assert!((f64::from(sure) - 1.0 / (1.0 + (-1.0_f64).exp())).abs() < 1e-3, "{sure}");
     assert_eq!(selected(0.25).0, [false; 4]);
+}
+
+#[test]
+fn a_text_must_be_among_the_words_that_fit_an_entry_best() {
+    let towards = |angle: f32| vec![angle.cos(), angle.sin()];
+    let bank = Bank {
+        dim: 2,
+        rows: [towards(0.0), towards(0.0).iter().map(|v| v * 3.0).collect()].concat(),
+    };
+    // The nearest word is 0.1 away from both entries, the third 0.3.
+    let words: Vec<Vec<f32>> = (1_u8..=10).map(|i| towards(f32::from(i) * 0.1)).collect();
+    let selects = |angle: f32, rivals: f64, unit_rows: bool| {
+        let names = vec!["away".to_owned()];
+        let method = ScoringMethod::of(Preset::Default, names, 10.0, 0.05, 0.0, rivals);
+        let method = ScoringMethod { unit_rows, ..method };
+        let canon = vec![towards(std::f32::consts::PI)];
+        let scoring = Scoring::new(&method, canon, words.clone().into()).unwrap();
+        let scorer = Scorer::new(&bank, scoring.into()).unwrap();
+        let text = scorer.text(&towards(angle)).unwrap();
+        assert_eq!(text.tables().len(), 1, "one blend");
+        assert_eq!(text.relevancies()[1] >= 0.5, text.selects(1));
+        [text.selects(1), text.selects(2)]
+    };
+    for unit_rows in [false, true] {
+        assert_eq!(selects(0.25, 0.3, unit_rows), [true; 2]);
+        assert_eq!(selects(0.35, 0.3, unit_rows), [false; 2]);
+        assert_eq!(selects(0.35, 0.4, unit_rows), [true; 2]);
+        // No share is less than one word.
+        assert_eq!(selects(0.05, 0.0, unit_rows), [true; 2]);
+        assert_eq!(selects(0.15, 0.0, unit_rows), [false; 2]);
+        assert_eq!(selects(0.95, 1.0, unit_rows), [true; 2]);
+    }
 }
