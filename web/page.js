@@ -99,6 +99,7 @@ let drawing = null,
 
 // ---- drawing --------------------------------------------------------------------------------
 function invalidate() {
+  $('view').dataset.state = 'busy'; // until a frame has shown what is asked for
   if (asked) return;
   asked = true;
   requestAnimationFrame(() => {
@@ -140,9 +141,10 @@ function frame() {
 
 // Lines over the scene: cameras, boxes of parts, measured points.
 function over(width, height) {
+  // Not on the graphics device: there the lines stayed where a frame only clears.
   const canvas = $('over'),
     dense = Math.min(devicePixelRatio, 2),
-    pen = canvas.getContext('2d');
+    pen = canvas.getContext('2d', { willReadFrequently: true });
   canvas.width = width * dense;
   canvas.height = height * dense;
   pen.clearRect(0, 0, canvas.width, canvas.height); // not every device clears by the size alone
@@ -256,7 +258,6 @@ function look(camera, still) {
       invalidate();
     }, 300);
   }
-  $('view').dataset.state = 'busy';
   invalidate();
 }
 

@@ -243,3 +243,4 @@ def test_a_thing_is_selected_by_a_click_without_a_word(page: Page, url: str, sce
     page.click("#words button[aria-label='Remove thing 1']")
     expect(page.locator("#words li")).to_have_count(0)
     assert page.evaluate("segsplat.state.words") == []
+    assert lines(page) == 0

@@ -29,11 +29,12 @@ pub(crate) fn write(
 ) -> Result<()> {
     let category =
         |(i, text): (usize, &String)| json!({ "id": i + 1, "name": text, "supercategory": "" });
+    let images: Vec<Value> = photos.iter().enumerate().map(|(i, photo)| image(i, photo)).collect();
     let head = json!({
         "info": info(of),
         "licenses": [],
         "categories": of.texts.iter().enumerate().map(category).collect::<Vec<Value>>(),
-        "images": photos.iter().enumerate().map(image).collect::<Vec<Value>>(),
+        "images": images,
     });
     zip.begin_text("annotations.json")?;
     let (mut id, mut list) = (0, zip.begin_list(&head, "annotations")?);
@@ -62,7 +63,7 @@ fn info(of: &FolderContents<'_>) -> Value {
     })
 }
 
-fn image((i, photo): (usize, &FolderPhoto)) -> Value {
+fn image(i: usize, photo: &FolderPhoto) -> Value {
     let Intrinsics { width, height, .. } = photo.camera.intrinsics;
     json!({ "id": i + 1, "file_name": photo.file, "width": width, "height": height })
 }

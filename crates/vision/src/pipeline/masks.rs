@@ -29,7 +29,7 @@ const GAUSSIANS_A_TASK: usize = 1 << 12;
 /// Whose turn it is where photos of a scene are at work side by side: each part of the network runs
 /// for one of them at a time, so that a device needs no more memory than for one photo.
 #[derive(Debug, Default)]
-struct Turns {
+struct PartLocks {
     encoder: Mutex<()>,
     decoder: Mutex<()>,
 }
@@ -39,7 +39,7 @@ struct Turns {
 pub struct SeenPhoto<'a> {
     network: &'a MaskNetwork,
     embedding: PhotoEmbedding,
-    turns: Option<&'a Turns>,
+    locks: Option<&'a PartLocks>,
 }
 
 impl<'a> SeenPhoto<'a> {
@@ -51,9 +51,13 @@ impl<'a> SeenPhoto<'a> {
         Self::in_turn(network, photo, None)
     }
 
-    fn in_turn(network: &'a MaskNetwork, photo: &Photo, turns: Option<&'a Turns>) -> Result<Self> {
-        let _turn = turns.map(|turns| turns.encoder.lock());
-        Ok(Self { network, embedding: network.encode(photo)?, turns })
+    fn in_turn(
+        network: &'a MaskNetwork,
+        photo: &Photo,
+        locks: Option<&'a PartLocks>,
+    ) -> Result<Self> {
+        let _lock = locks.map(|locks| locks.encoder.lock());
+        Ok(Self { network, embedding: network.encode(photo)?, locks })
     }
 }
 
@@ -67,7 +71,7 @@ impl PromptDecoder for SeenPhoto<'_> {
     }
 
     fn decode(&self, points: &[[f32; 2]]) -> Result<MaskLogits> {
-        let _turn = self.turns.map(|turns| turns.decoder.lock());
+        let _lock = self.locks.map(|locks| locks.decoder.lock());
         // Masks under the threshold are dropped by the filter, which does not look at them.
         let least = segment::iou_over(self.network.manifest().pred_iou_thresh);
         self.network.decode_over(&self.embedding, points, least)
@@ -81,12 +85,12 @@ impl PromptDecoder for SeenPhoto<'_> {
     }
 
     fn judge(&self, points: &[[f32; 2]], judging: &MaskJudging) -> Result<JudgedMasks> {
-        let _turn = self.turns.map(|turns| turns.decoder.lock());
+        let _lock = self.locks.map(|locks| locks.decoder.lock());
         self.network.judge(&self.embedding, points, judging)
     }
 
     fn on<'b>(&'b self, photo: &'b Photo) -> Result<Box<dyn PromptDecoder + 'b>> {
-        Ok(Box::new(SeenPhoto::in_turn(self.network, photo, self.turns)?))
+        Ok(Box::new(SeenPhoto::in_turn(self.network, photo, self.locks)?))
     }
 }
 
@@ -181,10 +185,10 @@ pub fn side_by_side(
     progress: &(dyn Fn(f32) + Sync),
     cancel: &AtomicBool,
 ) -> Result<Vec<PhotoMasks>> {
-    let (turns, next, done) = (Turns::default(), AtomicUsize::new(0), Mutex::new(0_usize));
+    let (locks, next, done) = (PartLocks::default(), AtomicUsize::new(0), Mutex::new(0_usize));
     let found = |posed: &PosedPhoto| {
         unless_cancelled(cancel)?;
-        let seen = SeenPhoto::in_turn(network, &posed.photo, Some(&turns))?;
+        let seen = SeenPhoto::in_turn(network, &posed.photo, Some(&locks))?;
         segment::everything(&seen, &posed.photo, settings, &[], cancel)
     };
     let work = || {
