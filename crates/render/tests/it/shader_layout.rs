@@ -102,6 +102,7 @@ fn structs_lie_in_memory_as_the_shaders_say() {
                 center,
                 center_low,
                 background,
+                ray_end,
                 focal,
                 principal,
                 slope_min,
