@@ -87,7 +87,7 @@ pub(super) struct DeviceTrainer {
     sh_degree: u8,
     /// Of each place.
     origins: Origins,
-    /// As they are now. A place without a Gaussian has opacity 0: one was dropped, or none came yet.
+    /// As they are now. A place without a Gaussian has opacity 0: one was dropped, or none came.
     scene: DeviceScene,
     /// Places from the first on, behind which none had a Gaussian yet.
     used: usize,

@@ -14,13 +14,14 @@ use segsplat_render::{DifferentiableRenderer, Kinds, RenderRequest, plan::defaul
 use super::Reconstruction;
 use crate::{
     error::Result,
+    models::{ResizeFilter, fit},
     refine::{
-        self, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, at_side, fewer,
-        held_out, mean_difference, ready, split,
+        self, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, fewer, held_out,
+        mean_difference, ready, split,
     },
     scene::{
-        Camera, Gaussians, HealthReport, Method, PosedPhoto, RefineReport, Scene, SceneCamera,
-        SceneMeta, Semantics,
+        Camera, Gaussians, HealthReport, Method, Photo, PosedPhoto, RefineReport, Scene,
+        SceneCamera, SceneMeta, Semantics,
     },
     semantics::{Views, from_source},
 };
@@ -201,6 +202,22 @@ fn awake<T>(renderer: &dyn DifferentiableRenderer, scene: &Scene, work: impl FnO
 /// A share of a time that may be endless.
 fn of_time(time: Duration, share: f32) -> Duration {
     Duration::try_from_secs_f64(time.as_secs_f64() * f64::from(share)).unwrap_or(Duration::MAX)
+}
+
+/// A photo whose longer side is `side` pixels, or as it is if that is shorter.
+fn at_side(posed: &PosedPhoto, side: u32) -> PosedPhoto {
+    let (width, height) = (posed.photo.width, posed.photo.height);
+    let longer = width.max(height);
+    if longer <= side {
+        return posed.clone();
+    }
+    let scaled = |length: u32| (length * side).div_ceil(longer).max(1);
+    let size = [scaled(height), scaled(width)];
+    let fitted = fit(&posed.photo, &posed.camera, size, ResizeFilter::default());
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0..255")]
+    let rgb = fitted.rgb.iter().map(|v| (v * 255.0).round() as u8).collect();
+    let photo = Photo { width: scaled(width), height: scaled(height), rgb, valid: fitted.valid };
+    PosedPhoto { photo, camera: fitted.camera, ..posed.clone() }
 }
 
 /// What refinement begins with: `learnt` and `one_set` were made of the photos of `scene` less

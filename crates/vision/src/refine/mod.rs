@@ -34,8 +34,7 @@ pub use segsplat_render::train::LearningRates;
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    models::{ResizeFilter, fit},
-    scene::{Camera, Gaussians, Photo, PosedPhoto, RefineReport, Scene},
+    scene::{Camera, Gaussians, Intrinsics, Photo, PosedPhoto, RefineReport, Scene},
 };
 
 /// Fewest photos of which one is held out.
@@ -98,8 +97,8 @@ pub struct RefineOptions {
     pub budget: RefineBudget,
     /// Photos of a step.
     pub batch: usize,
-    /// Longer side at which the photos are learnt at most, pixels: what is learnt smaller than it is
-    /// shown has gaps.
+    /// Longer side at which the photos are learnt at most, pixels: what is learnt smaller than it
+    /// is shown has gaps.
     pub side: u32,
     /// How far numbers move; `means` as a share of the scene's median depth.
     pub rates: LearningRates,
@@ -191,22 +190,6 @@ pub fn split(photos: &[PosedPhoto], held: &[usize]) -> (Vec<PosedPhoto>, Vec<Pos
         kept.map(|(_, photo)| photo.clone()).collect()
     };
     (of(false), of(true))
-}
-
-/// A photo whose longer side is `side` pixels, or as it is if that is shorter.
-pub(crate) fn at_side(posed: &PosedPhoto, side: u32) -> PosedPhoto {
-    let (width, height) = (posed.photo.width, posed.photo.height);
-    let longer = width.max(height);
-    if longer <= side {
-        return posed.clone();
-    }
-    let scaled = |length: u32| (length * side).div_ceil(longer).max(1);
-    let size = [scaled(height), scaled(width)];
-    let fitted = fit(&posed.photo, &posed.camera, size, ResizeFilter::default());
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0..255")]
-    let rgb = fitted.rgb.iter().map(|v| (v * 255.0).round() as u8).collect();
-    let photo = Photo { width: scaled(width), height: scaled(height), rgb, valid: fitted.valid };
-    PosedPhoto { photo, camera: fitted.camera, ..posed.clone() }
 }
 
 /// Mean absolute difference of what `gaussians` show, over what is behind those of `start`, and the
@@ -391,7 +374,32 @@ fn coarse_copies(photos: &[PosedPhoto], options: &RefineOptions) -> Vec<PosedPho
     if options.coarse_share <= 0.0 || least < COARSE_SIDE_MIN {
         return Vec::new();
     }
-    photos.par_iter().map(|posed| at_side(posed, longer(posed) / 2)).collect()
+    photos.par_iter().map(halved).collect()
+}
+
+/// A photo of half the size: the mean of each two by two pixels. One is known where all four are.
+fn halved(posed: &PosedPhoto) -> PosedPhoto {
+    let (photo, lens) = (&posed.photo, posed.camera.intrinsics);
+    let (width, height) = (photo.width / 2, photo.height / 2);
+    let four = |i: usize| {
+        let (x, y) = (2 * (i % width as usize), 2 * (i / width as usize));
+        let at = y * photo.width as usize + x;
+        [at, at + 1, at + photo.width as usize, at + photo.width as usize + 1]
+    };
+    let mean = |i: usize| -> [u8; 3] {
+        let sum = |c: usize| four(i).iter().map(|at| u16::from(photo.rgb[3 * at + c])).sum::<u16>();
+        std::array::from_fn(|c| (sum(c) + 2).div_euclid(4) as u8)
+    };
+    let pixels = 0..width as usize * height as usize;
+    let rgb = pixels.clone().flat_map(mean).collect();
+    let known = |valid: &Vec<bool>| -> Vec<bool> {
+        pixels.map(|i| four(i).iter().all(|at| valid[*at])).collect()
+    };
+    let valid = photo.valid.as_ref().map(known);
+    let [fx, fy, cx, cy] = [lens.fx, lens.fy, lens.cx, lens.cy].map(|v| v / 2.0);
+    let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
+    let camera = Camera { intrinsics, ..posed.camera };
+    PosedPhoto { photo: Photo { width, height, rgb, valid }, camera, ..posed.clone() }
 }
 
 /// Most Gaussians that such photos can tell apart.

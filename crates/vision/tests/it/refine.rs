@@ -210,8 +210,8 @@ fn gaussians_are_added_where_the_scene_differs_from_the_photos() {
     assert!(bound.len() <= start.len() + 7, "{} over the most", bound.len());
 }
 
-/// A renderer that says how wide the views are that it goes back from.
-struct Widths(CpuRenderer, Mutex<Vec<u32>>);
+/// A renderer that says how wide the views are that it goes back from, and their focal length.
+struct Widths(CpuRenderer, Mutex<Vec<(u32, f64)>>);
 
 impl Renderer for Widths {
     fn name(&self) -> String {
@@ -235,7 +235,8 @@ impl DifferentiableRenderer for Widths {
         loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
         gradients: &mut Gradients,
     ) -> Result<Frame> {
-        self.1.lock().expect("a lock").push(request.lens().width);
+        let lens = request.lens();
+        self.1.lock().expect("a lock").push((lens.width, lens.fx));
         self.0.backward(gaussians, request, loss, gradients)
     }
 }
@@ -257,10 +258,12 @@ fn large_photos_are_learnt_at_half_their_size_first() {
         renderer.1.into_inner().expect("a lock")
     };
     let found = widths(0.3, &photos);
-    assert_eq!((&found[..6], &found[6..]), (&[480; 6][..], &[960; 14][..]));
-    assert_eq!(widths(0.0, &photos), [960; 20]);
+    let focal = photos[0].camera.intrinsics.fx;
+    assert_eq!((&found[..6], &found[6..]), (&[(480, focal / 2.0); 6][..], &[(960, focal); 14][..]));
+    assert_eq!(widths(0.0, &photos), [(960, focal); 20]);
     let (_, small) = captured(5);
-    assert_eq!(widths(0.3, &small), [48; 20], "small photos have no smaller copies");
+    let focal = small[0].camera.intrinsics.fx;
+    assert_eq!(widths(0.3, &small), [(48, focal); 20], "small photos have no smaller copies");
 }
 
 #[test]
