@@ -44,7 +44,8 @@ switches! {
     /// Gaussian-tile pairs held at once; more are drawn in bands. `None`: as many as
     /// [`crate::constants::ISECTS_MAX`]. All renderers.
     isects_max: Option<u32>;
-    /// Gaussians from which a scene has blocks. `None`: [`crate::blocks::BLOCKS_MIN`]. All renderers.
+    /// Gaussians from which a scene has blocks. `None`: [`crate::blocks::BLOCKS_MIN`]. All
+    /// renderers.
     blocks_min: Option<usize>;
     /// Lanes of the CPU kernels. `None`: the widest of the processor.
     width: Option<Width>;
