@@ -49,6 +49,8 @@ const LOOKS: u32 = 10;
 /// them comes each time, and photos that say where: docs/adr/0070.
 const GROWS_BETWEEN: [f32; 2] = [0.1, 0.7];
 const GROWS_EVERY: u32 = 100;
+/// Expected steps under which none is added: they would not pay for it.
+const GROWS_FROM_STEPS: f32 = 300.0;
 const GROWTH_PHOTOS: usize = 4;
 /// Photos with a longer side under this have no smaller copies that come first.
 const COARSE_SIDE_MIN: u32 = 480;
@@ -470,7 +472,8 @@ impl Refinement<'_> {
             let of_size = |i: usize| if coarse { count + i } else { i };
             let [from, to] = GROWS_BETWEEN;
             let grows = options.growth > 0.0 && (from..to).contains(&spent) && !few;
-            if grows && steps >= grows_at {
+            let pays = steps as f32 >= GROWS_FROM_STEPS * spent;
+            if grows && pays && steps >= grows_at {
                 grows_at = steps + GROWS_EVERY;
                 let photos = shuffled(count, &mut random).into_iter().map(of_size);
                 let photos: Vec<usize> = photos.take(GROWTH_PHOTOS).collect();
