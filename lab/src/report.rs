@@ -9,7 +9,7 @@
 //! `today`.
 //!
 //! A row is *older* where a group of files that its table depends on is no longer what it was when
-//! the row was measured ([`crate::sources`]). A table shows the rows of this tree; where it has
+//! the row was measured (`lab/src/sources.rs`). A table shows the rows of this tree; where it has
 //! none, it shows the older ones, and says since when and what changed. So a change of a shader
 //! changes the page, and a page that does not say it is refused.
 //!

@@ -1,6 +1,6 @@
 //! Rows of measurements: one JSON object a line. Every row says what was run, of which commit, on
 //! which machine, and how large the error of the measured thing is, and has the hashes of what the
-//! measured code was built from ([`crate::sources`]).
+//! measured code was built from (`lab/src/sources.rs`).
 
 use std::{
     io::Write as _,
