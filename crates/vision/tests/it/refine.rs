@@ -121,6 +121,65 @@ fn cpu() -> CpuRenderer {
     CpuRenderer::new(2).expect("two threads")
 }
 
+/// A renderer on the processor that may say that it is a device, or have no room for a trainer. It
+/// counts its views, and keeps the width and the focal length of those that it goes back from.
+struct Watched {
+    cpu: CpuRenderer,
+    is_device: bool,
+    is_full: bool,
+    drawn: AtomicUsize,
+    lenses: Mutex<Vec<(u32, f64)>>,
+}
+
+fn watched() -> Watched {
+    let (drawn, lenses) = (AtomicUsize::new(0), Mutex::default());
+    Watched { cpu: cpu(), is_device: false, is_full: false, drawn, lenses }
+}
+
+impl Renderer for Watched {
+    fn name(&self) -> String {
+        self.cpu.name()
+    }
+
+    fn concurrency(&self) -> usize {
+        self.cpu.concurrency()
+    }
+
+    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        self.drawn.fetch_add(1, Ordering::SeqCst);
+        self.cpu.render(gaussians, request)
+    }
+}
+
+impl DifferentiableRenderer for Watched {
+    fn backward(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
+        gradients: &mut Gradients,
+    ) -> Result<Frame> {
+        let lens = request.lens();
+        self.lenses.lock().expect("a lock").push((lens.width, lens.fx));
+        self.cpu.backward(gaussians, request, loss, gradients)
+    }
+
+    fn trainer<'a>(
+        &'a self,
+        _set: &TrainingSet<'a>,
+        bytes_max: u64,
+    ) -> Result<Option<Box<dyn Trainer + 'a>>> {
+        match self.is_full {
+            true => Err(Error::limit("bytes", u64::MAX, bytes_max)),
+            false => Ok(None),
+        }
+    }
+
+    fn is_device(&self) -> bool {
+        self.is_device
+    }
+}
+
 #[test]
 fn a_disturbed_scene_gets_better_on_photos_that_were_held_out() {
     let (truth, photos) = captured(9);
@@ -134,7 +193,7 @@ fn a_disturbed_scene_gets_better_on_photos_that_were_held_out() {
     let entries = best.gaussians.semantic_index();
     assert!(entries.len() <= start.len() && entries.contains(&6), "entries");
     // Also where a device has no room: the same steps.
-    let again = refined(&Full(cpu()), &start, &photos, 150);
+    let again = refined(&Watched { is_full: true, ..watched() }, &start, &photos, 150);
     assert!(again.gaussians.means() == best.gaussians.means(), "the same steps");
     let untimed = |version: &RefinedVersion| segsplat_core::scene::RefineReport {
         seconds: 0.0,
@@ -210,37 +269,6 @@ fn gaussians_are_added_where_the_scene_differs_from_the_photos() {
     assert!(bound.len() <= start.len() + 7, "{} over the most", bound.len());
 }
 
-/// A renderer that says how wide the views are that it goes back from, and their focal length.
-struct Widths(CpuRenderer, Mutex<Vec<(u32, f64)>>);
-
-impl Renderer for Widths {
-    fn name(&self) -> String {
-        self.0.name()
-    }
-
-    fn concurrency(&self) -> usize {
-        self.0.concurrency()
-    }
-
-    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
-        self.0.render(gaussians, request)
-    }
-}
-
-impl DifferentiableRenderer for Widths {
-    fn backward(
-        &self,
-        gaussians: &Gaussians,
-        request: &RenderRequest,
-        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
-        gradients: &mut Gradients,
-    ) -> Result<Frame> {
-        let lens = request.lens();
-        self.1.lock().expect("a lock").push((lens.width, lens.fx));
-        self.0.backward(gaussians, request, loss, gradients)
-    }
-}
-
 #[test]
 fn large_photos_are_learnt_at_half_their_size_first() {
     let (truth, mut photos) = captured(5);
@@ -251,11 +279,11 @@ fn large_photos_are_learnt_at_half_their_size_first() {
         *posed = PosedPhoto { photo, camera, ..posed.clone() };
     }
     let widths = |coarse_share: f32, photos: &[PosedPhoto]| {
-        let renderer = Widths(cpu(), Mutex::default());
+        let renderer = watched();
         let budget = RefineBudget::steps(20);
         let options = RefineOptions { budget, coarse_share, growth: 0.0, ..Default::default() };
         refined_by(&renderer, &truth, photos, &options);
-        renderer.1.into_inner().expect("a lock")
+        renderer.lenses.into_inner().expect("a lock")
     };
     let found = widths(0.3, &photos);
     let focal = photos[0].camera.intrinsics.fx;
@@ -302,7 +330,7 @@ fn it_goes_on_from_the_proof_where_that_explains_photos_that_it_did_not_learn() 
 fn a_device_that_would_rest_draws_while_the_networks_work() {
     let (_, photos) = captured(9);
     for rests in [true, false] {
-        let renderer = Resting { cpu: cpu(), rests, drawn: AtomicUsize::new(0) };
+        let renderer = Watched { is_device: rests, ..watched() };
         let meanwhile = AtomicUsize::new(0);
         let made = || {
             let before = renderer.drawn.load(Ordering::SeqCst);
@@ -319,81 +347,6 @@ fn a_device_that_would_rest_draws_while_the_networks_work() {
         refined_whole(&renderer, &photos, (0.0, usize::MAX), &made);
         let drawn = meanwhile.into_inner();
         assert_eq!(drawn > 1, rests, "{drawn} views");
-    }
-}
-
-/// A renderer that may be slow after a rest, and counts its views.
-struct Resting {
-    cpu: CpuRenderer,
-    rests: bool,
-    drawn: AtomicUsize,
-}
-
-impl Renderer for Resting {
-    fn name(&self) -> String {
-        self.cpu.name()
-    }
-
-    fn concurrency(&self) -> usize {
-        self.cpu.concurrency()
-    }
-
-    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
-        self.drawn.fetch_add(1, Ordering::SeqCst);
-        self.cpu.render(gaussians, request)
-    }
-}
-
-impl DifferentiableRenderer for Resting {
-    fn backward(
-        &self,
-        gaussians: &Gaussians,
-        request: &RenderRequest,
-        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
-        gradients: &mut Gradients,
-    ) -> Result<Frame> {
-        self.cpu.backward(gaussians, request, loss, gradients)
-    }
-
-    fn is_device(&self) -> bool {
-        self.rests
-    }
-}
-
-/// A renderer whose device has no room for a trainer.
-struct Full(CpuRenderer);
-
-impl Renderer for Full {
-    fn name(&self) -> String {
-        self.0.name()
-    }
-
-    fn concurrency(&self) -> usize {
-        self.0.concurrency()
-    }
-
-    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
-        self.0.render(gaussians, request)
-    }
-}
-
-impl DifferentiableRenderer for Full {
-    fn backward(
-        &self,
-        gaussians: &Gaussians,
-        request: &RenderRequest,
-        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
-        gradients: &mut Gradients,
-    ) -> Result<Frame> {
-        self.0.backward(gaussians, request, loss, gradients)
-    }
-
-    fn trainer<'a>(
-        &'a self,
-        _set: &TrainingSet<'a>,
-        bytes_max: u64,
-    ) -> Result<Option<Box<dyn Trainer + 'a>>> {
-        Err(Error::limit("bytes", u64::MAX, bytes_max))
     }
 }
 
