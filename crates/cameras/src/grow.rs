@@ -7,15 +7,19 @@ use crate::{
     absolute::{self, Seen},
     adjust::{AdjustOptions, Bundle, Sight},
     lens::Lens,
-    pose::Pose,
+    pose::{Pose, angle_deg},
     rng::Rng,
-    survey::Survey,
+    survey::{Link, Survey},
     tracks::Sighting,
 };
 
 /// Points that a photo must agree with to be placed, and their share of those that it might see.
 const PLACED_MIN: f64 = 12.0;
-const PLACED_SHARE: f64 = 0.25;
+const PLACED_SHARE: f64 = 0.3;
+/// The share where the strongest link to a placed photo says the same turn, within
+/// [`TURN_MAX_DEG`].
+const CONFIRMED_SHARE: f64 = 0.1;
+const TURN_MAX_DEG: f64 = 10.0;
 /// Angle between two rays to a point, degrees, under which its depth is not known.
 const ANGLE_MIN_DEG: f64 = 1.0;
 /// Cameras from which on the focal length and the radial term move.
@@ -37,22 +41,28 @@ pub(crate) struct Grown {
 pub(crate) struct Grower<'a> {
     pub(crate) survey: &'a Survey,
     pub(crate) tracks: &'a [Vec<Sighting>],
+    pub(crate) links: &'a [Link],
     pub(crate) state: Grown,
 }
 
 impl<'a> Grower<'a> {
-    pub(crate) fn new(survey: &'a Survey, tracks: &'a [Vec<Sighting>], lenses: &[Lens]) -> Self {
+    pub(crate) fn new(
+        survey: &'a Survey,
+        tracks: &'a [Vec<Sighting>],
+        links: &'a [Link],
+        lenses: &[Lens],
+    ) -> Self {
         let state = Grown {
             poses: vec![None; survey.views.len()],
             lenses: lenses.to_vec(),
             points: vec![None; tracks.len()],
             agrees: tracks.iter().map(|track| vec![false; track.len()]).collect(),
         };
-        Self { survey, tracks, state }
+        Self { survey, tracks, links, state }
     }
 
     /// Grows from two photos and the pose of the second from the first.
-    pub(crate) fn from_pair(&mut self, photos: [usize; 2], pose: Pose, seed: u64) {
+    pub(crate) fn grow(&mut self, photos: [usize; 2], pose: Pose, seed: u64) {
         self.state.poses[photos[0]] = Some(Pose::identity());
         self.state.poses[photos[1]] = Some(pose);
         self.triangulate();
@@ -93,7 +103,7 @@ impl<'a> Grower<'a> {
     fn error2(&self, sighting: Sighting, point: &Vector3<f64>) -> f64 {
         let photo = sighting.0 as usize;
         let Some(pose) = &self.state.poses[photo] else { return f64::INFINITY };
-        let Some(pixel) = self.lens(sighting.0).project(&pose.to_camera(point)) else {
+        let Some(pixel) = self.lens(sighting.0).project(&pose.seen(point)) else {
             return f64::INFINITY;
         };
         let agree = self.survey.views[photo].agree_px;
@@ -145,7 +155,13 @@ impl<'a> Grower<'a> {
             let Some((pose, score)) = absolute::find(&seen, &lens, threshold, &mut rng) else {
                 continue;
             };
-            if score >= PLACED_MIN.max(PLACED_SHARE * seen.len() as f64) {
+            let confirmed = self.confirmed(photo, &pose);
+            let share = match confirmed {
+                Some(true) => CONFIRMED_SHARE,
+                None => PLACED_SHARE,
+                Some(false) => continue,
+            };
+            if score >= PLACED_MIN.max(share * seen.len() as f64) {
                 return Some((photo, pose));
             }
         }
@@ -200,6 +216,24 @@ impl<'a> Grower<'a> {
         let (_, _, point) = best?;
         let agrees = track.iter().map(|s| self.error2(*s, &point) < 1.0).collect();
         Some((point, agrees))
+    }
+
+    /// Whether the strongest links to placed photos say the same turn; `None` where there is none.
+    fn confirmed(&self, photo: usize, pose: &Pose) -> Option<bool> {
+        let turned = |link: &&Link| {
+            let [a, b] = link.photos;
+            let other = if a == photo { b } else { a };
+            let placed = self.state.poses[other].as_ref()?;
+            let (first, second) = if a == photo { (pose, placed) } else { (placed, pose) };
+            let off = link.geometry.pose.r.transpose() * second.r * first.r.transpose();
+            Some((link.strength(), angle_deg(&off)))
+        };
+        let own = self.links.iter().filter(|link| link.photos.contains(&photo));
+        let mut turns: Vec<(f64, f64)> = own.filter_map(|link| turned(&link)).collect();
+        turns.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let strongest = turns.first()?.0;
+        // One of those that are nearly as strong is enough: a plane has two turns that fit.
+        Some(turns.iter().any(|(strength, off)| *strength > 0.3 * strongest && *off < TURN_MAX_DEG))
     }
 
     fn options(&self, steps: usize) -> AdjustOptions {

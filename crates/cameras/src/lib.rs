@@ -14,6 +14,7 @@ mod pairs;
 mod pose;
 mod rng;
 mod roots;
+mod rotations;
 mod solver;
 mod survey;
 mod tracks;
@@ -149,8 +150,7 @@ pub fn solve(
     let survey = solver::survey(photos, matches, options);
     unless_cancelled(cancel)?;
     progress(0.05);
-    let candidates = solver::candidates(&survey);
-    unless_cancelled(cancel)?;
+    let candidates = solver::candidates(&survey, cancel, progress)?;
     let Some((best, others)) = candidates.split_first() else {
         let why = "no other photo shows enough of the same things".to_owned();
         return Ok(Solution {

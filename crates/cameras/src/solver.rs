@@ -1,7 +1,10 @@
 //! The order of the work: lenses, pairs, focal length, growing from several pairs, and the choice.
 
+use std::sync::atomic::AtomicBool;
+
 use nalgebra::Vector2;
 use rayon::prelude::*;
+use segsplat_core::{error::Result, scene::unless_cancelled};
 
 use crate::{
     PairMatches, PhotoKeypoints, SolveOptions,
@@ -9,6 +12,7 @@ use crate::{
     grow::{Grower, Grown},
     lens::Lens,
     pose::Pose,
+    rotations,
     survey::{Link, Pair, Survey, View},
     tracks::{self, Sighting},
     two_view,
@@ -62,7 +66,13 @@ pub(crate) fn survey(
         let middle = Vector2::new(f64::from(photo.size[0]), f64::from(photo.size[1])) * 0.5;
         let pixels =
             photo.keypoints.iter().map(|k| Vector2::new(k[0].into(), k[1].into()) - middle);
-        views.push(View { lens, pixels: pixels.collect(), agree_px: View::agree_px(side), side });
+        views.push(View {
+            lens,
+            pixels: pixels.collect(),
+            agree_px: View::agree_px(side),
+            side,
+            size: photo.size.map(f64::from),
+        });
     }
     let pairs = matches.iter().map(|given| {
         let mut order: Vec<usize> = (0..given.pairs.len()).collect();
@@ -79,17 +89,41 @@ fn is_link(link: &Link) -> bool {
 }
 
 /// All candidates, the best first.
-pub(crate) fn candidates(survey: &Survey) -> Vec<Candidate> {
+///
+/// # Errors
+/// `cancelled`.
+pub(crate) fn candidates(
+    survey: &Survey,
+    cancel: &AtomicBool,
+    progress: &(dyn Fn(f64) + Sync),
+) -> Result<Vec<Candidate>> {
     let known: Vec<Lens> = survey.priors.iter().map(|p| Lens { focal: p.focal, k1: 0.0 }).collect();
     let first = survey.links(&known, usize::MAX, None);
+    unless_cancelled(cancel)?;
+    progress(0.4);
     let mut all = Vec::new();
     for lenses in lenses_to_try(survey, &known, &first) {
+        unless_cancelled(cancel)?;
+        progress(0.6);
         let links = survey.links(&lenses, 60, Some(&first));
         let links: Vec<Link> = links.into_iter().flatten().filter(is_link).collect();
-        all.extend(grow_from_pairs(survey, &lenses, links));
+        let links = rotations::consistent(survey.views.len(), &links);
+        all.extend(grow_from_pairs(survey, &lenses, &links));
     }
     all.sort_by(|a, b| b.score.total_cmp(&a.score));
-    all
+    unless_cancelled(cancel)?;
+    progress(0.9);
+    Ok(all)
+}
+
+/// The links under the lenses that a solution found.
+pub(crate) fn links_under(survey: &Survey, best: &Candidate) -> Vec<Link> {
+    let mut before: Vec<Option<Link>> = vec![None; survey.pairs.len()];
+    for link in &best.links {
+        before[link.pair] = Some(link.clone());
+    }
+    let links = survey.links(&best.grown.lenses, 60, Some(&before));
+    links.into_iter().flatten().filter(is_link).collect()
 }
 
 /// Lenses with the focal lengths under which the pairs agree best.
@@ -132,7 +166,7 @@ fn lenses_to_try(survey: &Survey, known: &[Lens], first: &[Option<Link>]) -> Vec
 }
 
 /// Solutions from several first pairs.
-fn grow_from_pairs(survey: &Survey, lenses: &[Lens], links: Vec<Link>) -> Vec<Candidate> {
+fn grow_from_pairs(survey: &Survey, lenses: &[Lens], links: &[Link]) -> Vec<Candidate> {
     let counts: Vec<usize> = survey.views.iter().map(|v| v.pixels.len()).collect();
     let mut order: Vec<&Link> = links.iter().collect();
     order.sort_by(|a, b| b.geometry.score.total_cmp(&a.geometry.score).then(a.pair.cmp(&b.pair)));
@@ -145,16 +179,16 @@ fn grow_from_pairs(survey: &Survey, lenses: &[Lens], links: Vec<Link>) -> Vec<Ca
         })
     });
     let tracks = tracks::join(&counts, sightings);
-    let seeds = first_pairs(&links);
+    let seeds = first_pairs(links);
     let grown: Vec<Candidate> = seeds
         .par_iter()
         .filter_map(|link| {
-            let mut grower = Grower::new(survey, &tracks, lenses);
-            grower.from_pair(link.photos, link.geometry.pose, survey.seed);
+            let mut grower = Grower::new(survey, &tracks, links, lenses);
+            grower.grow(link.photos, link.geometry.pose, survey.seed);
             (grower.placed() >= 2).then(|| Candidate {
-                score: score_of(survey, &links, &grower.state),
+                score: score_of(survey, links, &grower.state),
                 grown: grower.state,
-                links: links.clone(),
+                links: links.to_vec(),
                 tracks: tracks.clone(),
             })
         })
