@@ -22,6 +22,8 @@ pub(crate) struct LensPrior {
     /// Focal length, pixels, and the spread of its logarithm.
     pub(crate) focal: f64,
     pub(crate) log_spread: f64,
+    /// Whether the focal length is from EXIF.
+    pub(crate) known: bool,
     /// Spread of k1 about 0.
     pub(crate) k1_spread: f64,
 }

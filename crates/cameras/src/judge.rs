@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Vector3};
 use crate::{
     grow::{Grower, Grown, angle_between},
     pose::{Pose, angle_deg},
-    solver::{Candidate, between, explained, links_under},
+    solver::{Candidate, between, explained, shares},
     survey::{Link, Survey},
 };
 
@@ -16,6 +16,19 @@ const DIFFERENT_DEG: f64 = 5.0;
 const NEAR_DEG: f64 = 12.0;
 /// Two photos with so many points in common should match.
 const POINTS_IN_BOTH_MIN: usize = 60;
+/// Under this number of near pairs nothing is said of those that did not match.
+const NEAR_PAIRS_MIN: u32 = 3;
+
+/// Confidence in two photos at most: nothing confirms a pair.
+const TWO_PLACED: f64 = 0.4;
+/// Where each kind of doubt halves the confidence; chosen on seven scenes (`docs/adr`, number 71).
+pub(crate) const WEAKEST_MIN: f64 = 0.5;
+const AGREEING_MIN: f64 = 0.75;
+pub(crate) const EXPLAINED_MIN: f64 = 0.8;
+pub(crate) const RIVAL_MAX: f64 = 0.95;
+pub(crate) const MIRRORED_MAX: f64 = 0.95;
+pub(crate) const MISSING_MAX: f64 = 0.7;
+const HELD_MIN: f64 = 25.0;
 
 /// What speaks for a solution and against it.
 #[derive(Clone, Copy, Debug, Default)]
@@ -93,19 +106,43 @@ pub(crate) fn mirrored(survey: &Survey, best: &Candidate) -> Option<Grown> {
     (grower.placed() >= 2).then_some(grower.state)
 }
 
+/// A number that goes from 0 to 1 about `middle`, nearly all of it within three times `width`.
+fn rising(value: f64, middle: f64, width: f64) -> f64 {
+    1.0 / (1.0 + ((middle - value) / width).exp())
+}
+
+/// The confidence that the evidence gives: the product of what each kind of doubt leaves.
+pub(crate) fn confidence(evidence: &Evidence) -> f64 {
+    if evidence.placed < 2 {
+        return 0.0;
+    }
+    let few =
+        if evidence.placed == 2 { TWO_PLACED } else { rising(evidence.held as f64, HELD_MIN, 6.0) };
+    few * rising(evidence.weakest, WEAKEST_MIN, 0.03)
+        * rising(evidence.agreeing, AGREEING_MIN, 0.05)
+        * rising(evidence.explained, EXPLAINED_MIN, 0.03)
+        * rising(-evidence.rival, -RIVAL_MAX, 0.015)
+        * rising(-evidence.mirrored, -MIRRORED_MAX, 0.015)
+        * rising(-evidence.missing, -MISSING_MAX, 0.05)
+}
+
 /// Sightings that agree with their points.
 fn fit(grown: &Grown) -> f64 {
     grown.agrees.iter().flatten().filter(|agrees| **agrees).count() as f64
 }
 
-/// The evidence for the first of the candidates; `others` are the rest.
-pub(crate) fn evidence(survey: &Survey, best: &Candidate, others: &[&Grown]) -> Evidence {
+/// The evidence for a solution; `relinked` are the links under its lenses, `others` the other
+/// solutions.
+pub(crate) fn evidence(
+    survey: &Survey,
+    best: &Candidate,
+    relinked: &[Link],
+    others: &[Grown],
+) -> Evidence {
     let grown = &best.grown;
-    let relinked = links_under(survey, best);
     let own_fit = fit(grown).max(1.0);
-    let mut share = vec![0.0_f64; grown.poses.len()];
     let (mut links, mut all, mut agreeing, mut inliers, mut near) = (0, 0.0, 0.0, 0.0, 0.0);
-    for link in &relinked {
+    for link in relinked {
         let [a, b] = link.photos;
         let (Some(first), Some(second)) = (&grown.poses[a], &grown.poses[b]) else { continue };
         let Some((seen, own)) = explained(survey, link, grown) else { continue };
@@ -113,10 +150,6 @@ pub(crate) fn evidence(survey: &Survey, best: &Candidate, others: &[&Grown]) -> 
         all += own;
         inliers += own;
         near += seen.min(own);
-        let of_pair = seen / survey.pairs[link.pair].matches.len() as f64;
-        for photo in link.photos {
-            share[photo] = share[photo].max(of_pair);
-        }
         let turned = between(first, second).r * link.geometry.pose.r.transpose();
         if angle_deg(&turned) < DIFFERENT_DEG {
             agreeing += own;
@@ -179,9 +212,9 @@ pub(crate) fn evidence(survey: &Survey, best: &Candidate, others: &[&Grown]) -> 
         held_median: of_placed.get(of_placed.len() / 2).copied().unwrap_or(0),
         angle_deg: median(&mut angles),
         error: median(&mut errors),
-        loops: loops(grown, &relinked),
-        missing: missing(survey, best, &relinked),
-        weakest: share
+        loops: loops(grown, relinked),
+        missing: missing(survey, best, relinked),
+        weakest: shares(survey, relinked, grown)
             .iter()
             .zip(&grown.poses)
             .filter(|(_, pose)| pose.is_some())
@@ -231,7 +264,7 @@ fn missing(survey: &Survey, best: &Candidate, links: &[Link]) -> f64 {
             lost += usize::from(!linked.contains(&index));
         }
     }
-    if near == 0 { 0.0 } else { lost as f64 / f64::from(near) }
+    if near < NEAR_PAIRS_MIN { 0.0 } else { lost as f64 / f64::from(near) }
 }
 
 /// Points, seen by one of the two photos, that both could see from nearly the same side.

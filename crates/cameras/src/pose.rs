@@ -18,6 +18,11 @@ impl Pose {
         self.r * world + self.t
     }
 
+    pub(crate) fn inverse(&self) -> Self {
+        let r = self.r.transpose();
+        Self { r, t: -(r * self.t) }
+    }
+
     pub(crate) fn center(&self) -> Vector3<f64> {
         -(self.r.transpose() * self.t)
     }

@@ -30,6 +30,9 @@ const SEEDS: usize = 4;
 /// A pair is a link of the view graph where chance gives so many such agreements at most.
 const LOG_CHANCE_MAX: f64 = -8.0;
 const LINK_INLIERS_MIN: usize = 15;
+/// A photo is held by a pair of which the cameras explain this share at least. Photos that only look
+/// alike agree in a third of their matches by the outline of things.
+const WEAK_SHARE: f64 = 0.42;
 
 /// A solution and what it was made from.
 pub(crate) struct Candidate {
@@ -59,6 +62,7 @@ pub(crate) fn survey(
             priors.push(LensPrior {
                 focal: photo.focal.unwrap_or(FOCAL_USUAL * side),
                 log_spread: if focal.is_some() { FOCAL_EXIF_SPREAD } else { FOCAL_USUAL_SPREAD },
+                known: focal.is_some(),
                 k1_spread: K1_SPREAD,
             });
             keys.len() - 1
@@ -116,8 +120,48 @@ pub(crate) fn candidates(
     Ok(all)
 }
 
+/// Takes photos out of a solution that no pair holds: in which the cameras explain less than
+/// [`WEAK_SHARE`] of the matches with any other photo. Returns the links under the final lenses and
+/// the photos that were taken out.
+pub(crate) fn drop_weak(survey: &Survey, best: &mut Candidate) -> (Vec<Link>, Vec<usize>) {
+    let mut dropped = Vec::new();
+    loop {
+        let links = links_under(survey, best);
+        let shares = shares(survey, &links, &best.grown);
+        let weak: Vec<usize> = (0..shares.len())
+            .filter(|&i| best.grown.poses[i].is_some() && shares[i] < WEAK_SHARE)
+            .collect();
+        let placed = best.grown.poses.iter().flatten().count();
+        // Where most are weak, none is worse than the others: the confidence says it.
+        if weak.is_empty() || 2 * weak.len() > placed {
+            return (links, dropped);
+        }
+        let mut grower = Grower::new(survey, &best.tracks, &[], &best.grown.lenses);
+        grower.state = best.grown.clone();
+        for photo in &weak {
+            grower.state.poses[*photo] = None;
+        }
+        grower.settle();
+        best.grown = grower.state;
+        dropped.extend(weak);
+    }
+}
+
+/// For each photo the largest share of a pair's matches that the cameras explain.
+pub(crate) fn shares(survey: &Survey, links: &[Link], grown: &Grown) -> Vec<f64> {
+    let mut shares = vec![0.0_f64; grown.poses.len()];
+    for link in links {
+        let Some((seen, _)) = explained(survey, link, grown) else { continue };
+        let share = seen / survey.pairs[link.pair].matches.len() as f64;
+        for photo in link.photos {
+            shares[photo] = shares[photo].max(share);
+        }
+    }
+    shares
+}
+
 /// The links under the lenses that a solution found.
-pub(crate) fn links_under(survey: &Survey, best: &Candidate) -> Vec<Link> {
+fn links_under(survey: &Survey, best: &Candidate) -> Vec<Link> {
     let mut before: Vec<Option<Link>> = vec![None; survey.pairs.len()];
     for link in &best.links {
         before[link.pair] = Some(link.clone());
@@ -128,8 +172,7 @@ pub(crate) fn links_under(survey: &Survey, best: &Candidate) -> Vec<Link> {
 
 /// Lenses with the focal lengths under which the pairs agree best.
 fn lenses_to_try(survey: &Survey, known: &[Lens], first: &[Option<Link>]) -> Vec<Vec<Lens>> {
-    let searched: Vec<bool> =
-        survey.priors.iter().map(|p| p.log_spread > FOCAL_EXIF_SPREAD).collect();
+    let searched: Vec<bool> = survey.priors.iter().map(|p| !p.known).collect();
     if !searched.contains(&true) {
         return vec![known.to_vec()];
     }
