@@ -264,6 +264,24 @@ fn any_input_is_an_answer_or_an_error_that_names_it() {
 }
 
 #[test]
+fn a_walk_of_many_photos_is_solved() {
+    let cameras: Vec<Truth> = (0..48)
+        .map(|i| {
+            let angle = f64::from(i) / 48.0 * std::f64::consts::TAU;
+            let center = DVec3::new(angle.sin(), 0.1 * (3.0 * angle).sin(), -angle.cos()) * 1.5;
+            Truth::looking_at(center, center * 3.0 + DVec3::Y * 0.2)
+        })
+        .collect();
+    let plan = Plan { points: room(2500, 3.0, 61), cameras, noise: 0.5, wrong: 0.2, ..plan() };
+    let (photos, pairs) = photos(&plan);
+    let solution = solved(&photos, &pairs).expect("a solution");
+    let off = off(&solution, &plan);
+    assert_eq!(off.placed, 48);
+    assert!(off.degrees < 1.0, "{} degrees", off.degrees);
+    assert!(solution.confidence > CONFIDENCE_MIN, "{:?}", solution.evidence);
+}
+
+#[test]
 fn the_world_has_size_one_and_stands_upright() {
     let plan = plan();
     let (photos, pairs) = photos(&plan);
