@@ -269,10 +269,10 @@ fn a_walk_of_many_photos_is_solved() {
         .map(|i| {
             let angle = f64::from(i) / 48.0 * std::f64::consts::TAU;
             let center = DVec3::new(angle.sin(), 0.1 * (3.0 * angle).sin(), -angle.cos()) * 1.5;
-            Truth::looking_at(center, center * 3.0 + DVec3::Y * 0.2)
+            Truth::looking_at(center, DVec3::Y * 0.2 - center)
         })
         .collect();
-    let plan = Plan { points: room(2500, 3.0, 61), cameras, noise: 0.5, wrong: 0.2, ..plan() };
+    let plan = Plan { points: room(3000, 3.0, 61), cameras, noise: 0.5, wrong: 0.2, ..plan() };
     let (photos, pairs) = photos(&plan);
     let solution = solved(&photos, &pairs).expect("a solution");
     let off = off(&solution, &plan);
