@@ -25,8 +25,9 @@ const POINTS_IN_BOTH_MIN: usize = 60;
 /// Under this number of near pairs nothing is said of those that did not match.
 const NEAR_PAIRS_MIN: u32 = 3;
 
-/// Confidence in two photos at most: nothing confirms a pair.
+/// Confidence in two photos at most: nothing confirms a pair, and it does not tell a focal length.
 const TWO_PLACED: f64 = 0.4;
+const TWO_PLACED_FOCAL_KNOWN: f64 = 0.7;
 /// Where each kind of doubt halves the confidence; chosen on seven scenes (`docs/adr`, number 71).
 pub(crate) const WEAKEST_MIN: f64 = 0.5;
 const AGREEING_MIN: f64 = 0.75;
@@ -91,8 +92,11 @@ pub(crate) fn confidence(evidence: &Evidence) -> f64 {
     if evidence.placed < 2 {
         return 0.0;
     }
-    let few =
-        if evidence.placed == 2 { TWO_PLACED } else { rising(evidence.held as f64, HELD_MIN, 6.0) };
+    let few = match (evidence.placed, evidence.focal_known) {
+        (2, true) => TWO_PLACED_FOCAL_KNOWN,
+        (2, false) => TWO_PLACED,
+        _ => rising(evidence.held as f64, HELD_MIN, 6.0),
+    };
     // A long chain without loops adds up its errors, and nothing shows them.
     let links = evidence.links as f64 / (evidence.placed - 1) as f64;
     let held = if evidence.placed < CHAIN_PLACED { 1.0 } else { rising(links, CHAIN_LINKS, 0.1) };
@@ -204,6 +208,11 @@ pub(crate) fn evidence(
             .map(|(share, _)| *share)
             .fold(1.0, f64::min),
         placed: of_placed.len(),
+        focal_known: survey
+            .views
+            .iter()
+            .zip(&grown.poses)
+            .all(|(view, pose)| pose.is_none() || survey.priors[view.lens].known),
     }
 }
 

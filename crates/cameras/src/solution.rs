@@ -90,4 +90,6 @@ pub struct Evidence {
     pub weakest: f64,
     /// Photos placed.
     pub placed: usize,
+    /// Whether the focal lengths of all of them are from EXIF.
+    pub focal_known: bool,
 }

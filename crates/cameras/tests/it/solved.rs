@@ -128,6 +128,21 @@ fn a_plane_is_solved_where_the_focal_length_is_known() {
 }
 
 #[test]
+fn two_photos_are_trusted_where_the_focal_length_is_known() {
+    let plan = Plan { noise: 0.5, wrong: 0.2, cameras: arc(2, 15.0, 4.0), ..plan() };
+    let (mut photos, pairs) = photos(&plan);
+    let unknown = solved(&photos, &pairs).expect("an answer");
+    assert!(unknown.confidence < CONFIDENCE_MIN, "{:?}", unknown.evidence);
+    for photo in &mut photos {
+        photo.focal = Some(plan.focal);
+    }
+    let known = solved(&photos, &pairs).expect("an answer");
+    let off = off(&known, &plan);
+    assert!(off.placed == 2 && off.degrees < 1.0, "{} degrees", off.degrees);
+    assert!(known.confidence > CONFIDENCE_MIN, "{:?}", known.evidence);
+}
+
+#[test]
 fn a_small_distant_thing_inside_out_is_doubted() {
     // Through a long lens both depths fit: the right one and its mirror image.
     let plan = Plan {
