@@ -131,7 +131,10 @@ impl Refiner {
     ) -> T {
         let work = || work(&*self.renderer);
         match &self.threads {
-            Some(threads) => threads.install(work),
+            Some(threads) => {
+                let span = tracing::Span::current();
+                threads.install(|| span.in_scope(work))
+            }
             None => work(),
         }
     }

@@ -161,7 +161,10 @@ impl Parts<'_, '_> {
             };
             if !gains {
                 // Too few steps may not have been enough; more that gain nothing are too many.
-                if whole.is_some() { break } else { continue }
+                if whole.is_some() || proven.steps == 0 {
+                    break;
+                }
+                continue;
             }
             last = proven.judged;
             let (start, gaussians, steps) = match whole.take() {
