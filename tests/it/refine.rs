@@ -190,7 +190,8 @@ fn what_the_network_said_is_united_again_without_some_photos() {
     let again =
         |held: &[usize]| make_for_refinement(&engine, &photos, held, &seen, watch).expect("united");
     let (all, one_set) = again(&[]);
-    assert!(all.gaussians == made.gaussians && all.backdrop == made.backdrop, "the same scene");
+    let numbers = [&all, &made].map(|it| (it.gaussians.means(), it.gaussians.scales()));
+    assert!(numbers[0] == numbers[1] && all.backdrop == made.backdrop, "the same scene");
     assert!(one_set.means() != all.gaussians.means(), "one set is made in another way");
     let (without, one_set) = again(&[1, 4]);
     let files: Vec<&str> = without.cameras.iter().map(|camera| &*camera.file).collect();
