@@ -70,7 +70,7 @@ fn inputs(network: &str) -> Vec<Tensor> {
     let identity = |n: usize| (0..n * n).map(move |i| f32::from(u8::from(i % (n + 1) == 0)));
     let poses = |views: usize, n: usize| (0..views).flat_map(|_| identity(n)).collect();
     match network {
-        "geometry" => vec![
+        "geometry" | "geometry.many" => vec![
             floats("images", &[2, 3, 32, 48]),
             tensor("intrinsics", &[2, 3, 3], TensorData::F32(poses(2, 3))),
             tensor("camera_to_world", &[2, 4, 4], TensorData::F32(poses(2, 4))),
@@ -362,7 +362,7 @@ async fn both_doors_say_what_is_there() {
         assert_eq!((&body["code"], &body["error"]), (&json!(code), &body["message"]), "{path}");
     }
     let unknown = get("/v2/models/nothing").await.unwrap_err();
-    assert!(unknown.message.contains("geometry, masks.encoder, masks.decoder"), "{unknown:?}");
+    assert!(unknown.message.contains("geometry, geometry.many, masks.encoder"), "{unknown:?}");
     let version = ModelReadyRequest { name: "geometry".to_owned(), version: "2".to_owned() };
     assert_eq!(fault_of(client.model_ready(version).await.unwrap_err()).code, "not_found");
 }

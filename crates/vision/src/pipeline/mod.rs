@@ -34,8 +34,14 @@ use crate::{
 };
 
 /// Parts of a bundle that are networks of their own, where it has them.
-pub const NETWORKS: [&str; 5] =
-    ["geometry", "masks.encoder", "masks.decoder", "image_text.image", "image_text.text"];
+pub const NETWORKS: [&str; 6] = [
+    "geometry",
+    "geometry.many",
+    "masks.encoder",
+    "masks.decoder",
+    "image_text.image",
+    "image_text.text",
+];
 
 /// Views that go through the geometry network together, where none are asked for: memory grows with
 /// them, and scenes get no better in the mean (docs/adr/0034-many-photos.md).
@@ -117,12 +123,14 @@ impl Pipeline {
         work: impl FnOnce(&Network) -> Result<T>,
     ) -> Result<T> {
         match part {
-            "geometry" => work(self.geometry.network()),
             "masks.encoder" => work(self.masks()?.encoder()),
             "masks.decoder" => work(self.masks()?.decoder()),
             "image_text.image" => work(self.image_text()?.image_tower()),
             "image_text.text" => work(self.image_text()?.text_tower()),
-            _ => Err(Error::new(ErrorCode::NotFound, "no network of this name")),
+            _ => match self.geometry.network(part) {
+                Some(network) => work(network),
+                None => Err(Error::new(ErrorCode::NotFound, "no network of this name")),
+            },
         }
     }
 
