@@ -1,0 +1,276 @@
+//! How far a solution can be trusted.
+
+use nalgebra::{Matrix3, Vector3};
+
+use crate::{
+    grow::{Grower, Grown, angle_between},
+    pose::{Pose, angle_deg},
+    solution::Evidence,
+    solver::{Candidate, between, explained, shares},
+    survey::{Link, Survey},
+    tracks::Sighting,
+};
+
+/// Solutions whose cameras are turned against each other by more than this differ, degrees.
+const DIFFERENT_DEG: f64 = 5.0;
+
+/// Rays to a point that differ by less see the same side of it, degrees.
+const NEAR_DEG: f64 = 12.0;
+/// Two photos with so many points in common should match.
+const POINTS_IN_BOTH_MIN: usize = 60;
+/// Under this number of near pairs nothing is said of those that did not match.
+const NEAR_PAIRS_MIN: u32 = 3;
+
+/// Confidence in two photos at most: nothing confirms a pair.
+const TWO_PLACED: f64 = 0.4;
+/// Where each kind of doubt halves the confidence; chosen on seven scenes (`docs/adr`, number 71).
+pub(crate) const WEAKEST_MIN: f64 = 0.5;
+const AGREEING_MIN: f64 = 0.75;
+pub(crate) const EXPLAINED_MIN: f64 = 0.8;
+pub(crate) const RIVAL_MAX: f64 = 0.95;
+pub(crate) const MIRRORED_MAX: f64 = 0.95;
+pub(crate) const MISSING_MAX: f64 = 0.55;
+pub(crate) const LOOPS_MIN: f64 = 0.15;
+/// Photos from which on the links of a photo are counted, and how many there must be.
+pub(crate) const CHAIN_PLACED: usize = 8;
+pub(crate) const CHAIN_LINKS: f64 = 1.5;
+const HELD_MIN: f64 = 25.0;
+
+/// Angles between the rotations of two solutions, over the pairs of photos that both place: the
+/// median, degrees.
+pub(crate) fn difference_deg(a: &Grown, b: &Grown) -> Option<f64> {
+    let both: Vec<(Matrix3<f64>, Matrix3<f64>)> =
+        a.poses.iter().zip(&b.poses).filter_map(|(a, b)| Some(((*a)?.r, (*b)?.r))).collect();
+    let mut angles = Vec::new();
+    for (i, (a, b)) in both.iter().enumerate() {
+        for (c, d) in &both[i + 1..] {
+            angles.push(angle_deg(&((c * a.transpose()) * (d * b.transpose()).transpose())));
+        }
+    }
+    angles.sort_by(f64::total_cmp);
+    angles.get(angles.len() / 2).copied()
+}
+
+/// The scene inside out: what a distant camera can hardly tell from it. `None` where too few fit.
+pub(crate) fn mirrored(survey: &Survey, best: &Candidate) -> Option<Grown> {
+    let points: Vec<Vector3<f64>> = best.grown.points.iter().flatten().copied().collect();
+    let reference = best.grown.poses.iter().flatten().next()?;
+    let n = points.len().max(1) as f64;
+    let middle = points.iter().sum::<Vector3<f64>>() / n;
+    // World axes of the reference camera, origin in the middle of the points.
+    let to_frame = |p: &Vector3<f64>| reference.r * (p - middle);
+    let flip = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, -1.0));
+    let mut grower = Grower::new(survey, &best.tracks, &[], &best.grown.lenses);
+    grower.state = best.grown.clone();
+    for point in grower.state.points.iter_mut().flatten() {
+        *point = flip * to_frame(point);
+    }
+    for pose in grower.state.poses.iter_mut().flatten() {
+        let r = pose.r * reference.r.transpose();
+        let t = pose.r * middle + pose.t;
+        *pose = Pose { r: flip * r * flip, t };
+    }
+    for _ in 0..3 {
+        grower.adjust(12);
+        grower.filter();
+        grower.triangulate();
+    }
+    (grower.placed() >= 2).then_some(grower.state)
+}
+
+/// A number that goes from 0 to 1 about `middle`, nearly all of it within three times `width`.
+fn rising(value: f64, middle: f64, width: f64) -> f64 {
+    1.0 / (1.0 + ((middle - value) / width).exp())
+}
+
+/// The confidence that the evidence gives: the product of what each kind of doubt leaves.
+pub(crate) fn confidence(evidence: &Evidence) -> f64 {
+    if evidence.placed < 2 {
+        return 0.0;
+    }
+    let few =
+        if evidence.placed == 2 { TWO_PLACED } else { rising(evidence.held as f64, HELD_MIN, 6.0) };
+    // A long chain without loops adds up its errors, and nothing shows them.
+    let links = evidence.links as f64 / (evidence.placed - 1) as f64;
+    let held = if evidence.placed < CHAIN_PLACED { 1.0 } else { rising(links, CHAIN_LINKS, 0.1) };
+    few * held
+        * rising(evidence.loops, LOOPS_MIN, 0.03)
+        * rising(evidence.weakest, WEAKEST_MIN, 0.03)
+        * rising(evidence.agreeing, AGREEING_MIN, 0.05)
+        * rising(evidence.explained, EXPLAINED_MIN, 0.03)
+        * rising(-evidence.rival, -RIVAL_MAX, 0.015)
+        * rising(-evidence.mirrored, -MIRRORED_MAX, 0.015)
+        * rising(-evidence.missing, -MISSING_MAX, 0.03)
+}
+
+/// Sightings that agree with their points, in photos that `best` placed.
+fn fit(best: &Candidate, grown: &Grown, tracks: &[Vec<Sighting>]) -> f64 {
+    let sightings = tracks.iter().flatten().zip(grown.agrees.iter().flatten());
+    let near = sightings
+        .filter(|(sighting, agrees)| **agrees && best.grown.poses[sighting.0 as usize].is_some());
+    near.count() as f64
+}
+
+/// The evidence for a solution; `relinked` are the links under its lenses, `others` the other
+/// solutions.
+pub(crate) fn evidence(
+    survey: &Survey,
+    best: &Candidate,
+    relinked: &[Link],
+    others: &[Candidate],
+) -> Evidence {
+    let grown = &best.grown;
+    let own_fit = fit(best, grown, &best.tracks).max(1.0);
+    let (mut links, mut all, mut agreeing, mut inliers, mut near) = (0, 0.0, 0.0, 0.0, 0.0);
+    for link in relinked {
+        let [a, b] = link.photos;
+        let (Some(first), Some(second)) = (&grown.poses[a], &grown.poses[b]) else { continue };
+        let Some((seen, own)) = explained(survey, link, grown) else { continue };
+        links += 1;
+        all += own;
+        inliers += own;
+        near += seen.min(own);
+        let turned = between(first, second).r * link.geometry.pose.r.transpose();
+        if angle_deg(&turned) < DIFFERENT_DEG {
+            agreeing += own;
+        }
+    }
+    let rival = others
+        .iter()
+        .filter(|other| {
+            difference_deg(grown, &other.grown).is_some_and(|angle| angle > DIFFERENT_DEG)
+        })
+        .map(|other| fit(best, &other.grown, &other.tracks) / own_fit)
+        .fold(0.0, f64::max);
+    let mirrored = mirrored(survey, best)
+        .filter(|other| difference_deg(grown, other).is_some_and(|angle| angle > DIFFERENT_DEG))
+        .map_or(0.0, |other| fit(best, &other, &best.tracks) / own_fit);
+    let mut held = vec![0; grown.poses.len()];
+    let mut angles = Vec::new();
+    let mut errors = Vec::new();
+    for ((track, agrees), point) in best.tracks.iter().zip(&grown.agrees).zip(&grown.points) {
+        let Some(point) = point else { continue };
+        let near: Vec<_> = track.iter().zip(agrees).filter(|(_, a)| **a).map(|(s, _)| s).collect();
+        if near.len() >= 3 {
+            for sighting in &near {
+                held[sighting.0 as usize] += 1;
+            }
+        }
+        let rays: Vec<Vector3<f64>> = near
+            .iter()
+            .filter_map(|s| {
+                let photo = s.0 as usize;
+                let view = &survey.views[photo];
+                let pose = grown.poses[photo].as_ref()?;
+                let pixel = grown.lenses[view.lens].project(&pose.seen(point))?;
+                errors.push((pixel - view.pixels[s.1 as usize]).norm() / view.agree_px);
+                Some((point - pose.center()).normalize())
+            })
+            .collect();
+        let pairs = rays
+            .iter()
+            .enumerate()
+            .flat_map(|(i, a)| rays[i + 1..].iter().map(move |b| angle_between(a, b)));
+        angles.push(pairs.fold(0.0, f64::max));
+    }
+    let median = |values: &mut Vec<f64>| {
+        values.sort_by(f64::total_cmp);
+        values.get(values.len() / 2).copied().unwrap_or(0.0)
+    };
+    let mut of_placed: Vec<usize> = held
+        .iter()
+        .zip(&grown.poses)
+        .filter(|(_, pose)| pose.is_some())
+        .map(|(held, _)| *held)
+        .collect();
+    of_placed.sort_unstable();
+    Evidence {
+        links,
+        agreeing: agreeing / f64::max(all, 1.0),
+        explained: near / f64::max(inliers, 1.0),
+        rival,
+        mirrored,
+        held: of_placed.first().copied().unwrap_or(0),
+        held_median: of_placed.get(of_placed.len() / 2).copied().unwrap_or(0),
+        angle_deg: median(&mut angles),
+        error: median(&mut errors),
+        loops: loops(grown, relinked),
+        missing: missing(survey, best, relinked),
+        weakest: shares(survey, relinked, grown)
+            .iter()
+            .zip(&grown.poses)
+            .filter(|(_, pose)| pose.is_some())
+            .map(|(share, _)| *share)
+            .fold(1.0, f64::min),
+        placed: of_placed.len(),
+    }
+}
+
+/// Share of loops of three links between placed photos whose turns close.
+fn loops(grown: &Grown, links: &[Link]) -> f64 {
+    let count = grown.poses.len();
+    let mut turns: Vec<Option<Matrix3<f64>>> = vec![None; count * count];
+    for link in links {
+        let [a, b] = link.photos;
+        if grown.poses[a].is_some() && grown.poses[b].is_some() {
+            turns[a * count + b] = Some(link.geometry.pose.r);
+            turns[b * count + a] = Some(link.geometry.pose.r.transpose());
+        }
+    }
+    let (mut all, mut closed) = (0, 0);
+    for a in 0..count {
+        for b in a + 1..count {
+            let Some(ab) = turns[a * count + b] else { continue };
+            for c in b + 1..count {
+                if let (Some(bc), Some(ca)) = (turns[b * count + c], turns[c * count + a]) {
+                    all += 1;
+                    closed += usize::from(angle_deg(&(ca * bc * ab)) < DIFFERENT_DEG);
+                }
+            }
+        }
+    }
+    if all == 0 { 1.0 } else { f64::from(closed as u32) / f64::from(all) }
+}
+
+/// Share of pairs of near cameras with many points in both photos that are no links.
+fn missing(survey: &Survey, best: &Candidate, links: &[Link]) -> f64 {
+    let grown = &best.grown;
+    let linked: std::collections::BTreeSet<usize> = links.iter().map(|link| link.pair).collect();
+    let (mut near, mut lost) = (0, 0);
+    for (index, pair) in survey.pairs.iter().enumerate() {
+        let [a, b] = pair.photos;
+        let (Some(first), Some(second)) = (&grown.poses[a], &grown.poses[b]) else { continue };
+        let both = points_in_both(survey, best, [(a, first), (b, second)]);
+        if both >= POINTS_IN_BOTH_MIN {
+            near += 1;
+            lost += usize::from(!linked.contains(&index));
+        }
+    }
+    if near < NEAR_PAIRS_MIN { 0.0 } else { lost as f64 / f64::from(near) }
+}
+
+/// Points, seen by one of the two photos, that both could see from nearly the same side.
+fn points_in_both(survey: &Survey, best: &Candidate, ends: [(usize, &Pose); 2]) -> usize {
+    let grown = &best.grown;
+    let tracks = best.tracks.iter().zip(&grown.agrees).zip(&grown.points);
+    let seen = tracks.filter(|((track, agrees), point)| {
+        let Some(point) = point else { return false };
+        let own = track.iter().zip(*agrees);
+        let by_one = own
+            .filter(|(_, agrees)| **agrees)
+            .any(|(s, _)| ends.iter().any(|(photo, _)| *photo == s.0 as usize));
+        let inside = |(photo, pose): (usize, &Pose)| {
+            let view = &survey.views[photo];
+            let pixel = grown.lenses[view.lens].project(&pose.seen(point));
+            pixel.is_some_and(|p| p.x.abs() < 0.5 * view.size[0] && p.y.abs() < 0.5 * view.size[1])
+        };
+        let rays = ends.map(|(_, pose)| (point - pose.center()).normalize());
+        let lengths = ends.map(|(_, pose)| (point - pose.center()).norm());
+        let scale = lengths[0] / lengths[1];
+        by_one
+            && ends.into_iter().all(inside)
+            && angle_between(&rays[0], &rays[1]) < NEAR_DEG
+            && (0.6..1.7).contains(&scale)
+    });
+    seen.count()
+}
