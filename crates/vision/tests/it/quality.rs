@@ -67,8 +67,7 @@ fn the_geometry_network_finds_the_depth_of_the_room() {
 }
 
 /// All numbers that the network gives for so many photos of a room.
-fn answer(bundle: &Bundle, runtime: &Arc<Runtime>, count: usize) -> Vec<f32> {
-    let network = Geometry::open(runtime, bundle, &network_options()).unwrap();
+fn answer(network: &Geometry, count: usize) -> Vec<f32> {
     let options = SampleOptions { photos: count, width: 256, height: 256, seed: 1 };
     let photos: Vec<PosedPhoto> = sample::photos(&options).unwrap();
     let others = |v: usize| (0..count).filter(|&other| other != v).take(3).collect();
@@ -103,10 +102,11 @@ fn the_cpus_own_files_of_geometry_agree_with_the_plain_ones() {
     let text = without(&without(&text, "[geometry.cpu]"), "[geometry.many.cpu]");
     std::fs::remove_file(plain.path().join("bundle.toml")).unwrap();
     std::fs::write(plain.path().join("bundle.toml"), text).unwrap();
-    let plain = Bundle::open(plain.path()).unwrap();
+    let bundles = [bundle(), Bundle::open(plain.path()).unwrap()];
+    let [own, plain] =
+        bundles.map(|bundle| Geometry::open(&runtime, &bundle, &network_options()).unwrap());
     for views in [2, 4] {
-        let own = answer(&bundle(), &runtime, views);
-        let wanted = answer(&plain, &runtime, views);
+        let (own, wanted) = (answer(&own, views), answer(&plain, views));
         assert_eq!(own.len(), wanted.len());
         let squares = |values: &mut dyn Iterator<Item = f32>| -> f64 {
             values.map(|v| f64::from(v).powi(2)).sum()
