@@ -71,7 +71,7 @@ impl Geometry {
                 what: WHAT,
                 file: weights.file,
                 cpu_file: weights.cpu_file,
-                signature: signature(manifest, weights.views.clone()),
+                signature: signature(manifest, *weights.views.start()),
                 memory: RunMemory::GivenBack,
                 tolerance: TOLERANCE,
                 probe: &|_| Ok(probe.inputs(manifest)),
@@ -347,15 +347,16 @@ pub(super) fn signatures(manifest: &GeometryManifest) -> Vec<Signature<'_>> {
     let mut all = Vec::new();
     for GeometryWeights { file, cpu_file, views, .. } in manifest.weights() {
         let files = [Some(file), cpu_file].into_iter().flatten();
-        all.extend(files.map(|file| (WHAT, file, signature(manifest, views.clone()))));
+        all.extend(files.map(|file| (WHAT, file, signature(manifest, *views.start()))));
     }
     all
 }
 
-/// The tensors of the manifest, for so many views.
-fn signature(manifest: &GeometryManifest, views: RangeInclusive<usize>) -> Vec<Wanted<'_>> {
+/// The tensors of the manifest, for so many views and more: a caller of the network itself may give
+/// one with weights for few views as many as the manifest allows.
+fn signature(manifest: &GeometryManifest, least: usize) -> Vec<Wanted<'_>> {
     let (inputs, outputs) = (&manifest.inputs, &manifest.outputs);
-    let views: Vec<usize> = views.collect();
+    let views: Vec<usize> = (least..=manifest.views_max).collect();
     let side = |axis: usize| manifest.buckets.iter().map(|b| b[axis] as usize).collect::<Vec<_>>();
     let of = |side, name, tail: &[&[usize]]| {
         let shape = [&[&*views], tail].concat().into_iter().map(<[usize]>::to_vec).collect();

@@ -247,7 +247,7 @@ fn every_fault_of_a_bundle_is_found_at_once() {
     let all = found.faults.join("\n");
     for wanted in [
         "geometry network: plane.onnx input \"images\" is",
-        "not f32 [2..4, 3, 32..48, 32..48]",
+        "not f32 [2..8, 3, 32..48, 32..48]",
         "plane.onnx output \"means\" is",
         "text.onnx has opset 99; it must be 7 to 26",
         "mask encoder: masks_encoder.onnx has no input \"picture\"",
@@ -281,7 +281,7 @@ fn a_network_of_another_shape_is_refused_when_it_is_opened() {
     patch(&dir, "plane.onnx", V, TWO);
     let bundle = Bundle::open(dir.path()).unwrap();
     let error = Geometry::open(&runtime, &bundle, &network_options()).unwrap_err();
-    assert!(error.message().contains("not f32 [2..4, 3, 32..48, 32..48]"), "{error}");
+    assert!(error.message().contains("not f32 [2..8, 3, 32..48, 32..48]"), "{error}");
     // The manifest says so: then it opens.
     let text = std::fs::read_to_string(dir.path().join("bundle.toml")).unwrap();
     let (before, after) = text.split_once("[geometry.many]").unwrap();
