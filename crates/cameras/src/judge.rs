@@ -29,7 +29,9 @@ const NEAR_PAIRS_MIN: u32 = 3;
 const TWO_PLACED: f64 = 0.4;
 const TWO_PLACED_FOCAL_KNOWN: f64 = 0.7;
 /// Where each kind of doubt halves the confidence; chosen on seven scenes (`docs/adr`, number 71).
-pub(crate) const WEAKEST_MIN: f64 = 0.5;
+const WEAKEST_MIN: f64 = 0.5;
+/// Added where the links are a tree: no loop shows what is wrong.
+const WEAKEST_OF_TREE: f64 = 0.12;
 const AGREEING_MIN: f64 = 0.75;
 pub(crate) const EXPLAINED_MIN: f64 = 0.8;
 pub(crate) const RIVAL_MAX: f64 = 0.95;
@@ -87,6 +89,19 @@ fn rising(value: f64, middle: f64, width: f64) -> f64 {
     1.0 / (1.0 + ((middle - value) / width).exp())
 }
 
+/// Where the share of the weakest photo halves the confidence: the fewer links there are a photo,
+/// the more each must be trusted.
+pub(crate) fn weakest_min(evidence: &Evidence) -> f64 {
+    if evidence.placed < 3 {
+        return WEAKEST_MIN;
+    }
+    let placed = evidence.placed as f64;
+    let links = evidence.links as f64 / (placed - 1.0);
+    // Three photos have no more than three links.
+    let enough = (0.5 * placed).min(2.0);
+    WEAKEST_MIN + WEAKEST_OF_TREE * (enough - links).clamp(0.0, 1.0)
+}
+
 /// The confidence that the evidence gives: the product of what each kind of doubt leaves.
 pub(crate) fn confidence(evidence: &Evidence) -> f64 {
     if evidence.placed < 2 {
@@ -102,7 +117,7 @@ pub(crate) fn confidence(evidence: &Evidence) -> f64 {
     let held = if evidence.placed < CHAIN_PLACED { 1.0 } else { rising(links, CHAIN_LINKS, 0.1) };
     few * held
         * rising(evidence.loops, LOOPS_MIN, 0.03)
-        * rising(evidence.weakest, WEAKEST_MIN, 0.03)
+        * rising(evidence.weakest, weakest_min(evidence), 0.03)
         * rising(evidence.agreeing, AGREEING_MIN, 0.05)
         * rising(evidence.explained, EXPLAINED_MIN, 0.03)
         * rising(-evidence.rival, -RIVAL_MAX, 0.015)

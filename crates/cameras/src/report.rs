@@ -4,7 +4,7 @@ use crate::{
     grow::Grown,
     judge::{
         CHAIN_LINKS, CHAIN_PLACED, EXPLAINED_MIN, LOOPS_MIN, MIRRORED_MAX, MISSING_MAX, RIVAL_MAX,
-        WEAKEST_MIN,
+        weakest_min,
     },
     solution::{CONFIDENCE_MIN, Evidence, Placing},
     survey::Survey,
@@ -72,7 +72,7 @@ fn doubt(evidence: &Evidence) -> &'static str {
         "two different solutions fit the photos equally well"
     } else if evidence.mirrored > MIRRORED_MAX {
         "the scene fits the photos inside out as well: take photos from nearer or wider apart"
-    } else if evidence.weakest < WEAKEST_MIN || evidence.explained < EXPLAINED_MIN {
+    } else if evidence.weakest < weakest_min(evidence) || evidence.explained < EXPLAINED_MIN {
         "many matches contradict the cameras: the photos may show different sides of a thing that \
          looks alike"
     } else if evidence.loops < LOOPS_MIN {
