@@ -1,10 +1,10 @@
 //! Solves match files and compares the cameras with given ones: `solve_scenes FILE.xm…`.
 //!
-//! `FOCAL=1` gives the true focal length, `SETS=4,8,16` the numbers of photos, `STARTS` how many sets
-//! of each. Little-endian files: `XM01`, the number of photos, for each photo width and height (u32),
-//! fx, cx, cy and the first three rows of the OpenCV camera-to-world (f64), the number of keypoints
-//! and their x and y (f32); the number of pairs, for each two photos, the number of matches, and for
-//! each match two keypoints (u32) and its score (f32).
+//! `FOCAL=1` gives the true focal length, `SETS=4,8,16` the numbers of photos, `STARTS` how many
+//! sets of each. Little-endian files: `XM01`, the number of photos, for each photo width and height
+//! (u32), fx, cx, cy and the first three rows of the OpenCV camera-to-world (f64), the number of
+//! keypoints and their x and y (f32); the number of pairs, for each two photos, the number of
+//! matches, and for each match two keypoints (u32) and its score (f32).
 #![allow(
     clippy::print_stdout,
     clippy::unwrap_used,

@@ -177,8 +177,8 @@ fn draw<const K: usize>(rng: &mut Rng, round: usize, count: usize) -> [usize; K]
     rng.sample::<K>(if round.is_multiple_of(2) && half <= count { half } else { count })
 }
 
-/// The essential matrix that most matches agree with. `matches` is in order of trust, `threshold` on
-/// the plane z = 1; `start` is a pose to begin with.
+/// The essential matrix that most matches agree with. `matches` is in order of trust,
+/// `threshold` on the plane z = 1; `start` is a pose to begin with.
 pub(crate) fn find(
     matches: &Directions,
     threshold: f64,
