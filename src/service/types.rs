@@ -357,7 +357,8 @@ impl Default for CallerLimits {
 #[schema(as = Model)]
 pub struct ModelInfo {
     /// What it does: `geometry`, `geometry.cpu`, `masks.encoder`, `masks.decoder`,
-    /// `image_text.image`, `image_text.text`, `image_text.tokenizer`, `image_text.words`.
+    /// `image_text.image`, `image_text.text`, `image_text.tokenizer`, `image_text.words`,
+    /// `features`.
     pub name: String,
     /// File in the bundle.
     pub file: String,

@@ -33,7 +33,7 @@ use crate::{
     },
 };
 
-/// Parts of a bundle that are networks of their own, where it has them.
+/// Parts of a bundle that are networks of their own and that callers may run.
 pub const NETWORKS: [&str; 5] =
     ["geometry", "masks.encoder", "masks.decoder", "image_text.image", "image_text.text"];
 
@@ -48,7 +48,7 @@ pub struct Pipeline {
     bundle: Bundle,
     geometry: Geometry,
     workers: rayon::ThreadPool,
-    lazy: networks::SemanticNetworks,
+    lazy: networks::LazyNetworks,
 }
 
 impl Pipeline {
@@ -72,7 +72,7 @@ impl Pipeline {
             .thread_name(|i| format!("pipeline-{i}"))
             .build()
             .map_err(|e| Error::internal("pipeline: no worker threads").caused_by(e))?;
-        let lazy = networks::SemanticNetworks::new(options);
+        let lazy = networks::LazyNetworks::new(options);
         let pipeline = Self { runtime, bundle, geometry, workers, lazy };
         // A device takes seconds for its first run, so that no text should wait for it. It is also
         // where a provider that computes the semantics wrong is refused.
