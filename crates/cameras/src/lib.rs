@@ -4,15 +4,30 @@
 //! Pixels are those of `segsplat_core`: the centre of the top left pixel is (0.5, 0.5). Cameras are
 //! OpenCV camera-to-world. Nothing here reads a photo or runs a network.
 
+mod absolute;
+mod adjust;
+mod five_point;
+mod grow;
+mod judge;
+mod lens;
 mod pairs;
+mod pose;
+mod rng;
+mod roots;
+mod solver;
+mod survey;
+mod tracks;
+mod two_view;
+mod world;
 
 use std::sync::atomic::AtomicBool;
 
 use segsplat_core::{
     error::{Error, Result},
-    scene::Camera,
+    scene::{Camera, unless_cancelled},
 };
 
+pub use judge::Evidence;
 pub use pairs::pairs_to_match;
 
 /// What is known of one photo.
@@ -103,6 +118,8 @@ pub struct Solution {
     /// Estimate of the share of such solutions that are right (within 5 degrees), 0..1. Under
     /// [`CONFIDENCE_MIN`] the cameras must not be used without asking.
     pub confidence: f64,
+    /// What the confidence is made of.
+    pub evidence: Evidence,
     /// What a person should know, words: doubts, photos that could not be placed surely, a focal
     /// length that the photos do not determine.
     pub warnings: Vec<String>,
@@ -128,6 +145,75 @@ pub fn solve(
     cancel: &AtomicBool,
     progress: &(dyn Fn(f64) + Sync),
 ) -> Result<Solution> {
-    let _ = (photos, matches, options, cancel, progress);
-    Err(Error::internal("not yet"))
+    check(photos, matches, options)?;
+    let survey = solver::survey(photos, matches, options);
+    unless_cancelled(cancel)?;
+    progress(0.05);
+    let candidates = solver::candidates(&survey);
+    unless_cancelled(cancel)?;
+    let Some((best, others)) = candidates.split_first() else {
+        let why = "no other photo shows enough of the same things".to_owned();
+        return Ok(Solution {
+            photos: vec![Placing::LeftOut(why); photos.len()],
+            points: Vec::new(),
+            confidence: 0.0,
+            evidence: Evidence::default(),
+            warnings: vec!["no two photos show enough of the same things".to_owned()],
+        });
+    };
+    let others: Vec<&grow::Grown> = others.iter().map(|other| &other.grown).collect();
+    let evidence = judge::evidence(&survey, best, &others);
+    let why_not = |_: usize| "too few points".to_owned();
+    let (placings, points) = world::outcome(photos, &survey, best, why_not)?;
+    progress(1.0);
+    Ok(Solution { photos: placings, points, confidence: 1.0, evidence, warnings: Vec::new() })
+}
+
+/// Refuses numbers that are not finite or out of range, and more of them than the options allow.
+fn check(photos: &[PhotoKeypoints], matches: &[PairMatches], options: &SolveOptions) -> Result<()> {
+    if photos.len() > options.photos_max {
+        return Err(Error::limit("photos", photos.len(), options.photos_max));
+    }
+    for (index, photo) in photos.iter().enumerate() {
+        let name = |what: &str| format!("photo {index}: {what}");
+        if photo.keypoints.len() > options.keypoints_max {
+            let bound = options.keypoints_max;
+            return Err(Error::limit(name("keypoints"), photo.keypoints.len(), bound));
+        }
+        if photo.size.contains(&0) {
+            let [width, height] = photo.size;
+            return Err(Error::invalid(name(&format!("{width}x{height} px; both must be over 0"))));
+        }
+        if let Some(focal) = photo.focal
+            && !(focal.is_finite() && focal > 0.0)
+        {
+            return Err(Error::invalid(name(&format!("focal is {focal}; it must be over 0"))));
+        }
+        if let Some(keypoint) = photo.keypoints.iter().find(|k| !k.iter().all(|v| v.is_finite())) {
+            return Err(Error::invalid(name(&format!("keypoint {keypoint:?} is not finite"))));
+        }
+    }
+    let mut known = std::collections::BTreeSet::new();
+    for pair in matches {
+        let [a, b] = pair.photos;
+        let name = |what: &str| format!("pair of photos {a} and {b}: {what}");
+        if a == b || a >= photos.len() || b >= photos.len() {
+            let count = photos.len();
+            return Err(Error::invalid(name(&format!("must be two different ones of {count}"))));
+        }
+        if !known.insert([a.min(b), a.max(b)]) {
+            return Err(Error::invalid(name("given twice")));
+        }
+        if !pair.scores.is_empty() && pair.scores.len() != pair.pairs.len() {
+            let (scores, pairs) = (pair.scores.len(), pair.pairs.len());
+            return Err(Error::invalid(name(&format!("{scores} scores of {pairs} matches"))));
+        }
+        for [i, j] in &pair.pairs {
+            if *i as usize >= photos[a].keypoints.len() || *j as usize >= photos[b].keypoints.len()
+            {
+                return Err(Error::invalid(name(&format!("no keypoints {i} and {j}"))));
+            }
+        }
+    }
+    Ok(())
 }

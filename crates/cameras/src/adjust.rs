@@ -1,0 +1,312 @@
+//! Bundle adjustment: poses, lenses and points that together fit the keypoints best. Levenberg and
+//! Marquardt's steps on Cauchy's loss, with the points eliminated (Schur complement); the system of
+//! cameras and lenses that is left is small and dense.
+
+use nalgebra::{DMatrix, DVector, Matrix2x3, Matrix3, SMatrix, SVector, Vector2, Vector3};
+
+use crate::{
+    lens::Lens,
+    pose::{Pose, cross},
+};
+
+/// A keypoint that a point is seen at.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Sight {
+    pub(crate) camera: usize,
+    pub(crate) pixel: Vector2<f64>,
+}
+
+/// What is known of a lens before: it pulls softly.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct LensPrior {
+    /// Focal length, pixels, and the spread of its logarithm.
+    pub(crate) focal: f64,
+    pub(crate) log_spread: f64,
+    /// Spread of k1 about 0.
+    pub(crate) k1_spread: f64,
+}
+
+/// Which numbers may move, and how far the loss trusts a keypoint.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct AdjustOptions {
+    pub(crate) steps: usize,
+    pub(crate) free_focal: bool,
+    pub(crate) free_k1: bool,
+    /// Distance at which a keypoint has half of its weight, pixels.
+    pub(crate) scale_px: f64,
+}
+
+/// The state that is adjusted. `poses` of cameras that no sight names stay.
+#[derive(Clone, Debug)]
+pub(crate) struct Bundle {
+    pub(crate) poses: Vec<Pose>,
+    /// Lens of each camera.
+    pub(crate) lens_of: Vec<usize>,
+    pub(crate) lenses: Vec<Lens>,
+    pub(crate) priors: Vec<LensPrior>,
+    pub(crate) points: Vec<Vector3<f64>>,
+    /// Sights of each point, at most one a camera.
+    pub(crate) sights: Vec<Vec<Sight>>,
+}
+
+type Block = SMatrix<f64, 6, 3>;
+type LensBlock = SMatrix<f64, 2, 3>;
+
+/// A point's part of the normal equations.
+struct PointPart {
+    inverse: Matrix3<f64>,
+    gradient: Vector3<f64>,
+    cameras: Vec<(usize, Block)>,
+    lenses: Vec<(usize, LensBlock)>,
+}
+
+const LENS_PARAMS: usize = 2;
+
+impl Bundle {
+    /// Cauchy's loss of all sights and the priors.
+    pub(crate) fn cost(&self, options: &AdjustOptions) -> f64 {
+        let s2 = options.scale_px * options.scale_px;
+        let mut sum = 0.0;
+        for (point, sights) in self.points.iter().zip(&self.sights) {
+            for sight in sights {
+                let lens = self.lenses[self.lens_of[sight.camera]];
+                let seen = lens.project(&self.poses[sight.camera].to_camera(point));
+                // Behind the camera: as far off as 100 px.
+                let e2 = seen.map_or(1e4, |p| (p - sight.pixel).norm_squared());
+                sum += s2 * (e2 / s2).ln_1p();
+            }
+        }
+        sum + self.prior_cost(options)
+    }
+
+    fn prior_cost(&self, options: &AdjustOptions) -> f64 {
+        let s2 = options.scale_px * options.scale_px;
+        let each = self.lenses.iter().zip(&self.priors).map(|(lens, prior)| {
+            let focal = (lens.focal / prior.focal).ln() / prior.log_spread;
+            let k1 = lens.k1 / prior.k1_spread;
+            focal * focal + k1 * k1
+        });
+        s2 * each.sum::<f64>()
+    }
+
+    /// Takes steps until they gain nothing. `fixed` is the camera that stays; its frame is the
+    /// world's. Returns the cost.
+    pub(crate) fn adjust(&mut self, fixed: usize, options: &AdjustOptions) -> f64 {
+        let mut cost = self.cost(options);
+        let mut damping = 1e-4;
+        for _ in 0..options.steps {
+            let mut gained = 0.0;
+            for _ in 0..6 {
+                let next = self.step(fixed, options, damping);
+                let next_cost = next.as_ref().map_or(f64::INFINITY, |n| n.cost(options));
+                if let Some(next) = next
+                    && next_cost < cost
+                {
+                    gained = (cost - next_cost) / cost.max(1e-12);
+                    cost = next_cost;
+                    *self = next;
+                    damping = (damping * 0.2_f64).max(1e-9);
+                    break;
+                }
+                damping *= 8.0;
+            }
+            if gained < 1e-5 {
+                break;
+            }
+        }
+        cost
+    }
+
+    /// The state after one step, or `None` where the equations cannot be solved.
+    fn step(&self, fixed: usize, options: &AdjustOptions, damping: f64) -> Option<Self> {
+        let mut slot = vec![None; self.poses.len()];
+        let mut cameras = 0;
+        for sight in self.sights.iter().flatten() {
+            if sight.camera != fixed && slot[sight.camera].is_none() {
+                slot[sight.camera] = Some(0);
+            }
+        }
+        for place in slot.iter_mut().flatten() {
+            *place = 6 * cameras;
+            cameras += 1;
+        }
+        let lens_at = 6 * cameras;
+        let size = lens_at + LENS_PARAMS * self.lenses.len();
+        let mut system = DMatrix::<f64>::zeros(size, size);
+        let mut right = DVector::<f64>::zeros(size);
+        let mut parts = Vec::with_capacity(self.points.len());
+        for (point, sights) in self.points.iter().zip(&self.sights) {
+            parts.push(self.add_point(
+                point,
+                sights,
+                &slot,
+                lens_at,
+                options,
+                damping,
+                &mut system,
+                &mut right,
+            ));
+        }
+        self.add_priors(lens_at, options, &mut system, &mut right);
+        for i in 0..size {
+            system[(i, i)] += 1e-12;
+        }
+        let delta = system.cholesky()?.solve(&right);
+        let mut next = self.clone();
+        for (pose, place) in next.poses.iter_mut().zip(&slot) {
+            if let Some(at) = *place {
+                let turn = Vector3::new(delta[at], delta[at + 1], delta[at + 2]);
+                let shift = Vector3::new(delta[at + 3], delta[at + 4], delta[at + 5]);
+                *pose = pose.moved(&turn, &shift);
+            }
+        }
+        for (i, lens) in next.lenses.iter_mut().enumerate() {
+            let at = lens_at + LENS_PARAMS * i;
+            lens.focal *= delta[at].clamp(-0.3, 0.3).exp();
+            lens.k1 = (lens.k1 + delta[at + 1]).clamp(-0.5, 0.5);
+        }
+        for (point, part) in next.points.iter_mut().zip(&parts) {
+            let Some(part) = part else { continue };
+            let mut gradient = part.gradient;
+            for (at, block) in &part.cameras {
+                gradient -= block.transpose() * delta.fixed_rows::<6>(*at);
+            }
+            for (lens, block) in &part.lenses {
+                let at = lens_at + LENS_PARAMS * lens;
+                gradient -= block.transpose() * delta.fixed_rows::<2>(at);
+            }
+            *point += part.inverse * gradient;
+        }
+        Some(next)
+    }
+
+    /// Adds a point's equations to the system of cameras, the point eliminated.
+    #[expect(clippy::too_many_arguments, reason = "one loop body of `step`, with its state")]
+    fn add_point(
+        &self,
+        point: &Vector3<f64>,
+        sights: &[Sight],
+        slot: &[Option<usize>],
+        lens_at: usize,
+        options: &AdjustOptions,
+        damping: f64,
+        system: &mut DMatrix<f64>,
+        right: &mut DVector<f64>,
+    ) -> Option<PointPart> {
+        let s2 = options.scale_px * options.scale_px;
+        let mut hessian = Matrix3::zeros();
+        let mut gradient = Vector3::zeros();
+        let mut cameras: Vec<(usize, Block)> = Vec::with_capacity(sights.len());
+        let mut lenses: Vec<(usize, LensBlock)> = Vec::new();
+        for sight in sights {
+            let pose = &self.poses[sight.camera];
+            let lens_index = self.lens_of[sight.camera];
+            let seen = pose.to_camera(point);
+            let Some((pixel, by_seen, mut by_lens)) = self.lenses[lens_index].derivatives(&seen)
+            else {
+                continue;
+            };
+            if !options.free_focal {
+                by_lens.column_mut(0).fill(0.0);
+            }
+            if !options.free_k1 {
+                by_lens.column_mut(1).fill(0.0);
+            }
+            let rest = sight.pixel - pixel;
+            let weight = 1.0 / (1.0 + rest.norm_squared() / s2);
+            let by_point: Matrix2x3<f64> = by_seen * pose.r;
+            hessian += by_point.transpose() * by_point * weight;
+            gradient += by_point.transpose() * rest * weight;
+            let at = lens_at + LENS_PARAMS * lens_index;
+            let lens_block: LensBlock = by_lens.transpose() * by_point * weight;
+            match lenses.iter_mut().find(|(index, _)| *index == lens_index) {
+                Some((_, block)) => *block += lens_block,
+                None => lenses.push((lens_index, lens_block)),
+            }
+            let own = by_lens.transpose() * by_lens * weight;
+            let mut view = system.fixed_view_mut::<2, 2>(at, at);
+            view += own * (1.0 + damping);
+            let mut rows = right.fixed_rows_mut::<2>(at);
+            rows += by_lens.transpose() * rest * weight;
+            let Some(camera_at) = slot[sight.camera] else { continue };
+            let turn: Matrix2x3<f64> = -by_seen * cross(&seen);
+            let mut by_pose = SMatrix::<f64, 2, 6>::zeros();
+            by_pose.fixed_columns_mut::<3>(0).copy_from(&turn);
+            by_pose.fixed_columns_mut::<3>(3).copy_from(&by_seen);
+            let mut own: SMatrix<f64, 6, 6> = by_pose.transpose() * by_pose * weight;
+            for i in 0..6 {
+                own[(i, i)] *= 1.0 + damping;
+            }
+            let mut view = system.fixed_view_mut::<6, 6>(camera_at, camera_at);
+            view += own;
+            let mut view = system.fixed_view_mut::<2, 6>(at, camera_at);
+            view += by_lens.transpose() * by_pose * weight;
+            let mut rows = right.fixed_rows_mut::<6>(camera_at);
+            rows += by_pose.transpose() * rest * weight;
+            cameras.push((camera_at, by_pose.transpose() * by_point * weight));
+        }
+        for i in 0..3 {
+            hessian[(i, i)] = hessian[(i, i)] * (1.0 + damping) + 1e-12;
+        }
+        let inverse = hessian.try_inverse()?;
+        for (a, (row, left)) in cameras.iter().enumerate() {
+            let scaled = left * inverse;
+            let mut rows = right.fixed_rows_mut::<6>(*row);
+            rows -= scaled * gradient;
+            for (column, other) in &cameras[..=a] {
+                // The lower triangle is what Cholesky's method reads.
+                let block = scaled * other.transpose();
+                if row >= column {
+                    let mut view = system.fixed_view_mut::<6, 6>(*row, *column);
+                    view -= block;
+                } else {
+                    let mut view = system.fixed_view_mut::<6, 6>(*column, *row);
+                    view -= block.transpose();
+                }
+            }
+        }
+        for (a, (lens, left)) in lenses.iter().enumerate() {
+            let row = lens_at + LENS_PARAMS * lens;
+            let scaled = left * inverse;
+            let mut rows = right.fixed_rows_mut::<2>(row);
+            rows -= scaled * gradient;
+            for (column, other) in &cameras {
+                let mut view = system.fixed_view_mut::<2, 6>(row, *column);
+                view -= scaled * other.transpose();
+            }
+            for (other_lens, other) in &lenses[..=a] {
+                let column = lens_at + LENS_PARAMS * other_lens;
+                let block = scaled * other.transpose();
+                if row >= column {
+                    let mut view = system.fixed_view_mut::<2, 2>(row, column);
+                    view -= block;
+                } else {
+                    let mut view = system.fixed_view_mut::<2, 2>(column, row);
+                    view -= block.transpose();
+                }
+            }
+        }
+        Some(PointPart { inverse, gradient, cameras, lenses })
+    }
+
+    fn add_priors(
+        &self,
+        lens_at: usize,
+        options: &AdjustOptions,
+        system: &mut DMatrix<f64>,
+        right: &mut DVector<f64>,
+    ) {
+        let s2 = options.scale_px * options.scale_px;
+        for (i, (lens, prior)) in self.lenses.iter().zip(&self.priors).enumerate() {
+            let at = lens_at + LENS_PARAMS * i;
+            let weights = [prior.log_spread, prior.k1_spread].map(|s| s2 / (s * s));
+            let rest = SVector::<f64, 2>::new((prior.focal / lens.focal).ln(), -lens.k1);
+            for (k, free) in [options.free_focal, options.free_k1].into_iter().enumerate() {
+                // A number that is held has only this equation: it stays.
+                let (weight, rest) = if free { (weights[k], rest[k]) } else { (1.0, 0.0) };
+                system[(at + k, at + k)] += weight;
+                right[at + k] += weight * rest;
+            }
+        }
+    }
+}

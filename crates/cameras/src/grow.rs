@@ -1,0 +1,323 @@
+//! Cameras one after the other from a first pair: each next photo by the points that it sees, each
+//! time with new points, an adjustment, and what does not fit taken out.
+
+use nalgebra::{Matrix3, Vector2, Vector3};
+
+use crate::{
+    absolute::{self, Seen},
+    adjust::{AdjustOptions, Bundle, Sight},
+    lens::Lens,
+    pose::Pose,
+    rng::Rng,
+    survey::Survey,
+    tracks::Sighting,
+};
+
+/// Points that a photo must agree with to be placed, and their share of those that it might see.
+const PLACED_MIN: f64 = 12.0;
+const PLACED_SHARE: f64 = 0.25;
+/// Angle between two rays to a point, degrees, under which its depth is not known.
+const ANGLE_MIN_DEG: f64 = 1.0;
+/// Cameras from which on the focal length and the radial term move.
+const FREE_FOCAL: usize = 3;
+const FREE_K1: usize = 4;
+
+/// Cameras and points.
+#[derive(Clone, Debug)]
+pub(crate) struct Grown {
+    pub(crate) poses: Vec<Option<Pose>>,
+    pub(crate) lenses: Vec<Lens>,
+    /// A place for each track, where it is known.
+    pub(crate) points: Vec<Option<Vector3<f64>>>,
+    /// Whether each sighting of each track agrees with its point.
+    pub(crate) agrees: Vec<Vec<bool>>,
+}
+
+/// The growing state and what it grows on.
+pub(crate) struct Grower<'a> {
+    pub(crate) survey: &'a Survey,
+    pub(crate) tracks: &'a [Vec<Sighting>],
+    pub(crate) state: Grown,
+}
+
+impl<'a> Grower<'a> {
+    pub(crate) fn new(survey: &'a Survey, tracks: &'a [Vec<Sighting>], lenses: &[Lens]) -> Self {
+        let state = Grown {
+            poses: vec![None; survey.views.len()],
+            lenses: lenses.to_vec(),
+            points: vec![None; tracks.len()],
+            agrees: tracks.iter().map(|track| vec![false; track.len()]).collect(),
+        };
+        Self { survey, tracks, state }
+    }
+
+    /// Grows from two photos and the pose of the second from the first.
+    pub(crate) fn from_pair(&mut self, photos: [usize; 2], pose: Pose, seed: u64) {
+        self.state.poses[photos[0]] = Some(Pose::identity());
+        self.state.poses[photos[1]] = Some(pose);
+        self.triangulate();
+        self.adjust(6);
+        self.filter();
+        self.place_all(seed);
+    }
+
+    /// Places photos until none fits, then adjusts everything.
+    pub(crate) fn place_all(&mut self, seed: u64) {
+        while let Some((photo, pose)) = self.next_photo(seed) {
+            self.state.poses[photo] = Some(pose);
+            self.triangulate();
+            self.adjust(4);
+            self.filter();
+        }
+        for _ in 0..2 {
+            self.triangulate();
+            self.adjust(12);
+            self.filter();
+        }
+        self.drop_loose();
+    }
+
+    pub(crate) fn placed(&self) -> usize {
+        self.state.poses.iter().flatten().count()
+    }
+
+    fn pixel(&self, (photo, keypoint): Sighting) -> Vector2<f64> {
+        self.survey.views[photo as usize].pixels[keypoint as usize]
+    }
+
+    fn lens(&self, photo: u32) -> Lens {
+        self.state.lenses[self.survey.views[photo as usize].lens]
+    }
+
+    /// Squared distance of a sighting to a point, in units of the photo's agreement distance.
+    fn error2(&self, sighting: Sighting, point: &Vector3<f64>) -> f64 {
+        let photo = sighting.0 as usize;
+        let Some(pose) = &self.state.poses[photo] else { return f64::INFINITY };
+        let Some(pixel) = self.lens(sighting.0).project(&pose.to_camera(point)) else {
+            return f64::INFINITY;
+        };
+        let agree = self.survey.views[photo].agree_px;
+        (pixel - self.pixel(sighting)).norm_squared() / (agree * agree)
+    }
+
+    /// Known points that an unplaced photo may see.
+    fn seen_by(&self, photo: usize) -> Vec<Seen> {
+        let mut seen = Vec::new();
+        for (track, point) in self.tracks.iter().zip(&self.state.points) {
+            let Some(point) = point else { continue };
+            if let Some(sighting) = track.iter().find(|s| s.0 as usize == photo) {
+                seen.push(Seen { point: *point, pixel: self.pixel(*sighting) });
+            }
+        }
+        seen
+    }
+
+    /// How many known points a photo may see, those near each other counted less.
+    fn coverage(&self, photo: usize, seen: &[Seen]) -> usize {
+        let side = self.survey.views[photo].side;
+        let mut covered = 0;
+        for level in 1..=4_u32 {
+            let cells = 1_usize << level;
+            let mut hit = vec![false; cells * cells];
+            for s in seen {
+                let cell =
+                    |v: f64| (((v / side + 0.5) * cells as f64).max(0.0) as usize).min(cells - 1);
+                hit[cell(s.pixel.y) * cells + cell(s.pixel.x)] = true;
+            }
+            covered += hit.iter().filter(|h| **h).count() << level;
+        }
+        covered
+    }
+
+    /// The photo that sees the known points best, and its pose.
+    fn next_photo(&self, seed: u64) -> Option<(usize, Pose)> {
+        let mut waiting: Vec<(usize, usize, Vec<Seen>)> = (0..self.state.poses.len())
+            .filter(|&photo| self.state.poses[photo].is_none())
+            .map(|photo| (photo, self.seen_by(photo)))
+            .filter(|(_, seen)| seen.len() as f64 >= PLACED_MIN)
+            .map(|(photo, seen)| (self.coverage(photo, &seen), photo, seen))
+            .collect();
+        waiting.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.cmp(&b.1)));
+        for (_, photo, seen) in waiting {
+            let lens = self.lens(photo as u32);
+            let threshold = 1.5 * self.survey.views[photo].agree_px;
+            let mut rng = Rng::new(seed, photo as u64 + 1000 * self.placed() as u64);
+            let Some((pose, score)) = absolute::find(&seen, &lens, threshold, &mut rng) else {
+                continue;
+            };
+            if score >= PLACED_MIN.max(PLACED_SHARE * seen.len() as f64) {
+                return Some((photo, pose));
+            }
+        }
+        None
+    }
+
+    /// Gives tracks without a point one, and sightings that now fit a point to it.
+    pub(crate) fn triangulate(&mut self) {
+        for index in 0..self.tracks.len() {
+            let track = &self.tracks[index];
+            if let Some(point) = self.state.points[index] {
+                for (k, sighting) in track.iter().enumerate() {
+                    self.state.agrees[index][k] = self.error2(*sighting, &point) < 1.0;
+                }
+                continue;
+            }
+            if let Some((point, agrees)) = self.point_of(track) {
+                self.state.points[index] = Some(point);
+                self.state.agrees[index] = agrees;
+            }
+        }
+    }
+
+    /// The point that most sightings of a track agree with.
+    fn point_of(&self, track: &[Sighting]) -> Option<(Vector3<f64>, Vec<bool>)> {
+        let placed: Vec<(Vector3<f64>, Vector3<f64>)> = track
+            .iter()
+            .filter_map(|s| {
+                let pose = self.state.poses[s.0 as usize].as_ref()?;
+                let ray = self.lens(s.0).direction(&self.pixel(*s)).push(1.0);
+                Some((pose.center(), (pose.r.transpose() * ray).normalize()))
+            })
+            .take(8)
+            .collect();
+        let mut best: Option<(usize, f64, Vector3<f64>)> = None;
+        for i in 0..placed.len() {
+            for j in i + 1..placed.len() {
+                let (angle, rays) =
+                    (angle_between(&placed[i].1, &placed[j].1), [placed[i], placed[j]]);
+                if angle < ANGLE_MIN_DEG {
+                    continue;
+                }
+                let Some(point) = nearest_to(&rays) else { continue };
+                let errors = track.iter().map(|s| self.error2(*s, &point));
+                let near = errors.clone().filter(|e| *e < 1.0).count();
+                let sum: f64 = errors.filter(|e| *e < 1.0).sum();
+                if near >= 2 && best.is_none_or(|b| near > b.0 || (near == b.0 && sum < b.1)) {
+                    best = Some((near, sum, point));
+                }
+            }
+        }
+        let (_, _, point) = best?;
+        let agrees = track.iter().map(|s| self.error2(*s, &point) < 1.0).collect();
+        Some((point, agrees))
+    }
+
+    fn options(&self, steps: usize) -> AdjustOptions {
+        let placed = self.placed();
+        let scale_px = self.survey.views.iter().map(|v| v.agree_px).fold(0.0, f64::max) * 0.5;
+        AdjustOptions {
+            steps,
+            free_focal: placed >= FREE_FOCAL,
+            free_k1: placed >= FREE_K1,
+            scale_px,
+        }
+    }
+
+    /// The state as a bundle, and the track of each of its points.
+    fn bundle(&self) -> (Bundle, Vec<usize>) {
+        let mut tracks = Vec::new();
+        let mut points = Vec::new();
+        let mut sights = Vec::new();
+        for (index, point) in self.state.points.iter().enumerate() {
+            let Some(point) = point else { continue };
+            let of_track = self.tracks[index].iter().zip(&self.state.agrees[index]);
+            let own: Vec<Sight> = of_track
+                .filter(|(_, agrees)| **agrees)
+                .map(|(s, _)| Sight { camera: s.0 as usize, pixel: self.pixel(*s) })
+                .collect();
+            if own.len() >= 2 {
+                tracks.push(index);
+                points.push(*point);
+                sights.push(own);
+            }
+        }
+        let poses = self.state.poses.iter().map(|p| p.unwrap_or_else(Pose::identity)).collect();
+        let bundle = Bundle {
+            poses,
+            lens_of: self.survey.views.iter().map(|v| v.lens).collect(),
+            lenses: self.state.lenses.clone(),
+            priors: self.survey.priors.clone(),
+            points,
+            sights,
+        };
+        (bundle, tracks)
+    }
+
+    /// Adjusts everything that is placed. Returns the cost.
+    pub(crate) fn adjust(&mut self, steps: usize) -> f64 {
+        let Some(fixed) = self.state.poses.iter().position(Option::is_some) else { return 0.0 };
+        let (mut bundle, tracks) = self.bundle();
+        let cost = bundle.adjust(fixed, &self.options(steps));
+        for (pose, moved) in self.state.poses.iter_mut().zip(bundle.poses) {
+            if let Some(pose) = pose {
+                *pose = moved;
+            }
+        }
+        self.state.lenses = bundle.lenses;
+        for (track, point) in tracks.into_iter().zip(bundle.points) {
+            self.state.points[track] = Some(point);
+        }
+        cost
+    }
+
+    /// Takes out sightings that do not fit and points that too few or too parallel rays see.
+    pub(crate) fn filter(&mut self) {
+        for index in 0..self.tracks.len() {
+            let Some(point) = self.state.points[index] else { continue };
+            let mut rays: Vec<Vector3<f64>> = Vec::new();
+            for (k, sighting) in self.tracks[index].iter().enumerate() {
+                let agrees = self.error2(*sighting, &point) < 1.0;
+                self.state.agrees[index][k] = agrees;
+                if let (true, Some(pose)) = (agrees, &self.state.poses[sighting.0 as usize]) {
+                    rays.push((point - pose.center()).normalize());
+                }
+            }
+            let wide = rays
+                .iter()
+                .enumerate()
+                .any(|(i, a)| rays[i + 1..].iter().any(|b| angle_between(a, b) >= ANGLE_MIN_DEG));
+            if !wide {
+                self.state.points[index] = None;
+                self.state.agrees[index].fill(false);
+            }
+        }
+    }
+
+    /// Takes out photos that too few points hold.
+    fn drop_loose(&mut self) {
+        loop {
+            let mut held = vec![0; self.state.poses.len()];
+            for (track, agrees) in self.tracks.iter().zip(&self.state.agrees) {
+                for (sighting, _) in track.iter().zip(agrees).filter(|(_, agrees)| **agrees) {
+                    held[sighting.0 as usize] += 1;
+                }
+            }
+            let loose: Vec<usize> = (0..held.len())
+                .filter(|&i| self.state.poses[i].is_some() && (held[i] as f64) < PLACED_MIN)
+                .collect();
+            if loose.is_empty() {
+                return;
+            }
+            for photo in loose {
+                self.state.poses[photo] = None;
+            }
+            self.filter();
+        }
+    }
+}
+
+pub(crate) fn angle_between(a: &Vector3<f64>, b: &Vector3<f64>) -> f64 {
+    a.cross(b).norm().atan2(a.dot(b)).to_degrees()
+}
+
+/// The point nearest to rays (centre and unit direction).
+fn nearest_to(rays: &[(Vector3<f64>, Vector3<f64>)]) -> Option<Vector3<f64>> {
+    let mut sum = Matrix3::zeros();
+    let mut right = Vector3::zeros();
+    for (center, ray) in rays {
+        let across = Matrix3::identity() - ray * ray.transpose();
+        sum += across;
+        right += across * center;
+    }
+    Some(sum.try_inverse()? * right).filter(|p| p.iter().all(|v| v.is_finite()))
+}

@@ -1,0 +1,212 @@
+//! The order of the work: lenses, pairs, focal length, growing from several pairs, and the choice.
+
+use nalgebra::Vector2;
+use rayon::prelude::*;
+
+use crate::{
+    PairMatches, PhotoKeypoints, SolveOptions,
+    adjust::LensPrior,
+    grow::{Grower, Grown},
+    lens::Lens,
+    pose::Pose,
+    survey::{Link, Pair, Survey, View},
+    tracks::{self, Sighting},
+    two_view,
+};
+
+/// Focal lengths that are tried, as shares of the longer side.
+const FOCALS: [f64; 10] = [0.45, 0.55, 0.65, 0.75, 0.87, 1.0, 1.2, 1.45, 1.8, 2.4];
+/// The focal length of most photos: that of telephones.
+const FOCAL_USUAL: f64 = 0.8;
+const FOCAL_USUAL_SPREAD: f64 = 0.5;
+const FOCAL_EXIF_SPREAD: f64 = 0.03;
+const K1_SPREAD: f64 = 0.1;
+/// First pairs that are tried for each focal length.
+const SEEDS: usize = 4;
+/// A pair is a link of the view graph where chance gives so many such agreements at most.
+const LOG_CHANCE_MAX: f64 = -8.0;
+const LINK_INLIERS_MIN: usize = 15;
+
+/// A solution and what it was made from.
+pub(crate) struct Candidate {
+    pub(crate) grown: Grown,
+    pub(crate) links: Vec<Link>,
+    pub(crate) tracks: Vec<Vec<Sighting>>,
+    pub(crate) score: f64,
+}
+
+/// Keypoints from the photos' middles, lenses and pairs.
+pub(crate) fn survey(
+    photos: &[PhotoKeypoints],
+    matches: &[PairMatches],
+    options: &SolveOptions,
+) -> Survey {
+    let mut keys: Vec<([u32; 2], Option<u64>, usize)> = Vec::new();
+    let mut priors: Vec<LensPrior> = Vec::new();
+    let mut views = Vec::new();
+    for (index, photo) in photos.iter().enumerate() {
+        let side = f64::from(photo.size[0].max(photo.size[1]));
+        // Photos of one size and one focal length (within 0.1 %) share a lens.
+        let focal = photo.focal.map(|f| ((f / side).ln() * 1000.0).round().to_bits());
+        let upright = [photo.size[0].min(photo.size[1]), photo.size[0].max(photo.size[1])];
+        let key = (upright, focal, if options.one_lens { 0 } else { index });
+        let lens = keys.iter().position(|k| *k == key).unwrap_or_else(|| {
+            keys.push(key);
+            priors.push(LensPrior {
+                focal: photo.focal.unwrap_or(FOCAL_USUAL * side),
+                log_spread: if focal.is_some() { FOCAL_EXIF_SPREAD } else { FOCAL_USUAL_SPREAD },
+                k1_spread: K1_SPREAD,
+            });
+            keys.len() - 1
+        });
+        let middle = Vector2::new(f64::from(photo.size[0]), f64::from(photo.size[1])) * 0.5;
+        let pixels =
+            photo.keypoints.iter().map(|k| Vector2::new(k[0].into(), k[1].into()) - middle);
+        views.push(View { lens, pixels: pixels.collect(), agree_px: View::agree_px(side), side });
+    }
+    let pairs = matches.iter().map(|given| {
+        let mut order: Vec<usize> = (0..given.pairs.len()).collect();
+        if given.scores.len() == given.pairs.len() {
+            order.sort_by(|&a, &b| given.scores[b].total_cmp(&given.scores[a]).then(a.cmp(&b)));
+        }
+        Pair { photos: given.photos, matches: order.iter().map(|&i| given.pairs[i]).collect() }
+    });
+    Survey { views, pairs: pairs.collect(), priors, seed: options.seed }
+}
+
+fn is_link(link: &Link) -> bool {
+    link.geometry.log_chance < LOG_CHANCE_MAX && link.geometry.inliers.len() >= LINK_INLIERS_MIN
+}
+
+/// All candidates, the best first.
+pub(crate) fn candidates(survey: &Survey) -> Vec<Candidate> {
+    let known: Vec<Lens> = survey.priors.iter().map(|p| Lens { focal: p.focal, k1: 0.0 }).collect();
+    let first = survey.links(&known, usize::MAX, None);
+    let mut all = Vec::new();
+    for lenses in lenses_to_try(survey, &known, &first) {
+        let links = survey.links(&lenses, 60, Some(&first));
+        let links: Vec<Link> = links.into_iter().flatten().filter(is_link).collect();
+        all.extend(grow_from_pairs(survey, &lenses, links));
+    }
+    all.sort_by(|a, b| b.score.total_cmp(&a.score));
+    all
+}
+
+/// Lenses with the focal lengths under which the pairs agree best.
+fn lenses_to_try(survey: &Survey, known: &[Lens], first: &[Option<Link>]) -> Vec<Vec<Lens>> {
+    let searched: Vec<bool> =
+        survey.priors.iter().map(|p| p.log_spread > FOCAL_EXIF_SPREAD).collect();
+    if !searched.contains(&true) {
+        return vec![known.to_vec()];
+    }
+    let scaled = |share: f64| -> Vec<Lens> {
+        let each = known.iter().zip(&searched).map(|(lens, &searched)| {
+            let scale = if searched { share / FOCAL_USUAL } else { 1.0 };
+            Lens { focal: lens.focal * scale, ..*lens }
+        });
+        each.collect()
+    };
+    let mut strong: Vec<&Link> = first.iter().flatten().filter(|l| is_link(l)).collect();
+    strong.sort_by(|a, b| b.geometry.score.total_cmp(&a.geometry.score));
+    strong.truncate(24);
+    let score = |share: &f64| -> f64 {
+        let lenses = scaled(*share);
+        let each = strong.par_iter().map(|link| {
+            let pair = &survey.pairs[link.pair];
+            let directions = survey.directions(pair, &lenses);
+            let threshold = survey.threshold(pair, &lenses);
+            let mut rng = crate::rng::Rng::new(survey.seed, link.pair as u64);
+            let start = Some(link.geometry.pose);
+            two_view::find(&directions, threshold, 40, start, &mut rng).map_or(0.0, |f| f.1)
+        });
+        // A sum in a fixed order.
+        each.collect::<Vec<f64>>().into_iter().sum()
+    };
+    let scores: Vec<f64> = FOCALS.iter().map(score).collect();
+    let best = (0..FOCALS.len()).max_by(|&a, &b| scores[a].total_cmp(&scores[b])).unwrap_or(0);
+    let mut shares = vec![FOCALS[best]];
+    if (FOCALS[best] / FOCAL_USUAL).ln().abs() > 0.15 {
+        shares.push(FOCAL_USUAL);
+    }
+    shares.into_iter().map(scaled).collect()
+}
+
+/// Solutions from several first pairs.
+fn grow_from_pairs(survey: &Survey, lenses: &[Lens], links: Vec<Link>) -> Vec<Candidate> {
+    let counts: Vec<usize> = survey.views.iter().map(|v| v.pixels.len()).collect();
+    let mut order: Vec<&Link> = links.iter().collect();
+    order.sort_by(|a, b| b.geometry.score.total_cmp(&a.geometry.score).then(a.pair.cmp(&b.pair)));
+    let sightings = order.iter().flat_map(|link| {
+        let pair = &survey.pairs[link.pair];
+        let [a, b] = pair.photos.map(|p| p as u32);
+        link.geometry.inliers.iter().map(move |&i| {
+            let [k, l] = pair.matches[i as usize];
+            [(a, k), (b, l)]
+        })
+    });
+    let tracks = tracks::join(&counts, sightings);
+    let seeds = first_pairs(&links);
+    let grown: Vec<Candidate> = seeds
+        .par_iter()
+        .filter_map(|link| {
+            let mut grower = Grower::new(survey, &tracks, lenses);
+            grower.from_pair(link.photos, link.geometry.pose, survey.seed);
+            (grower.placed() >= 2).then(|| Candidate {
+                score: score_of(survey, &links, &grower.state),
+                grown: grower.state,
+                links: links.clone(),
+                tracks: tracks.clone(),
+            })
+        })
+        .collect();
+    grown
+}
+
+/// Pairs to start from: many matches, rays that meet at a wide angle, and no two of the same photo
+/// where it can be avoided.
+fn first_pairs(links: &[Link]) -> Vec<Link> {
+    let worth = |link: &Link| {
+        let geometry = &link.geometry;
+        let parallax = geometry.inliers.len() as f64 * (1.0 - geometry.rotation_share);
+        let depth = 1.0 - 0.5 * geometry.plane_share;
+        parallax * depth * (geometry.angle_deg / 8.0).min(1.0)
+    };
+    let mut order: Vec<&Link> = links.iter().collect();
+    order.sort_by(|a, b| worth(b).total_cmp(&worth(a)).then(a.pair.cmp(&b.pair)));
+    let mut picked: Vec<Link> = Vec::new();
+    for link in &order {
+        let new = picked.iter().all(|p| p.photos.iter().all(|x| !link.photos.contains(x)));
+        if picked.len() < SEEDS && new {
+            picked.push((*link).clone());
+        }
+    }
+    for link in order {
+        if picked.len() < SEEDS && picked.iter().all(|p| p.pair != link.pair) {
+            picked.push(link.clone());
+        }
+    }
+    picked
+}
+
+/// The pose of the second photo from the first; the distance is 1 where they are apart.
+pub(crate) fn between(first: &Pose, second: &Pose) -> Pose {
+    let r = second.r * first.r.transpose();
+    let t = second.t - r * first.t;
+    Pose { r, t: t.try_normalize(1e-12).unwrap_or_default() }
+}
+
+/// How many of the links' matches a solution explains.
+pub(crate) fn score_of(survey: &Survey, links: &[Link], grown: &Grown) -> f64 {
+    links.iter().map(|link| explained(survey, link, grown).map_or(0.0, |e| e.0)).sum()
+}
+
+/// Matches of a link's pair that a solution explains, and those that the link's own geometry does.
+pub(crate) fn explained(survey: &Survey, link: &Link, grown: &Grown) -> Option<(f64, f64)> {
+    let [a, b] = link.photos;
+    let (first, second) = (grown.poses[a].as_ref()?, grown.poses[b].as_ref()?);
+    let pair = &survey.pairs[link.pair];
+    let directions = survey.directions(pair, &grown.lenses);
+    let threshold = survey.threshold(pair, &grown.lenses);
+    let near = two_view::inliers_of(&between(first, second), &directions, threshold * threshold);
+    Some((near.len() as f64, link.geometry.inliers.len() as f64))
+}
