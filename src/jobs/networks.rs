@@ -6,7 +6,7 @@ use crate::{
     error::{Error, ErrorCode, Result},
     models::Provider,
     pipeline::{
-        self, PhotoSet, Pipeline, PipelineLoader, Reconstruction,
+        self, PhotoSet, Pipeline, PipelineLoader, Reconstruction, UnposedSet,
         semantics::{SemanticsInput, label_photos},
     },
     scene::{Gaussians, Method, PosedPhoto, Scene, SceneOptions, Semantics, TextEmbedding, Watch},
@@ -67,6 +67,15 @@ pub trait SceneNetworks: Send + Sync {
     /// none.
     fn pipeline(&self) -> Result<&Pipeline> {
         Err(Error::new(ErrorCode::ModelUnavailable, "there are no networks"))
+    }
+
+    /// Finds the cameras of photos that came without, on the calling thread.
+    ///
+    /// # Errors
+    /// Any code; it becomes the scene's `error`.
+    fn pose(&self, _: UnposedSet, _: Watch<'_>) -> Result<PhotoSet> {
+        let why = "no network finds the cameras of photos; send cameras with them";
+        Err(Error::new(ErrorCode::ModelUnavailable, why))
     }
 
     /// Does the whole work on the calling thread.
@@ -224,6 +233,10 @@ impl SceneNetworks for PipelineNetworks {
             let why = "the networks are being opened; ask again";
             Err(Error::new(ErrorCode::ModelUnavailable, why).retry_after_s(OPENING_RETRY_S))
         })
+    }
+
+    fn pose(&self, photos: UnposedSet, watch: Watch<'_>) -> Result<PhotoSet> {
+        pipeline::cameras::posed(self.0.get()?, photos, watch)
     }
 
     fn make(

@@ -201,7 +201,7 @@ impl Jobs {
         let PhotoSet { photos, warnings, .. } = upload.photos()?;
         let options = refine_options(order.ms, &self.parts.limits.get());
         let mut remake = |photos: Vec<PosedPhoto>| {
-            let photos = PhotoSet { photos, warnings: warnings.clone(), read_ms: 0.0 };
+            let photos = PhotoSet::given(photos, warnings.clone(), 0.0);
             self.parts.scenes.make_for_refinement(&photos, &record.options, watch)
         };
         let mut told = 0.0;

@@ -63,6 +63,8 @@ pub struct UnposedPhoto {
     pub file: String,
     /// Pixels.
     pub photo: Photo,
+    /// Width and height of the file's picture, upright: `photo` may be smaller.
+    pub file_size: [u32; 2],
     /// Focal length in pixels, as the photo's EXIF gives it: some per cent off.
     pub focal: Option<f64>,
 }

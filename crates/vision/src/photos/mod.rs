@@ -6,10 +6,12 @@
 //! mask leaves out is not valid.
 
 mod decode;
+mod exif;
 mod kinds;
 mod mask;
 mod turns;
 mod undistort;
+mod unposed;
 
 use std::{collections::BTreeMap, ops::Range, path::Path, sync::atomic::AtomicBool};
 
@@ -20,13 +22,20 @@ use self::{
     decode::Header,
     turns::{SIDE_COMPARED, Way},
 };
+pub use self::unposed::{ReadUnposed, posed};
 pub use crate::scene::{Upload, UploadCameras, UploadFile};
 use crate::{
     error::{Result, short},
-    formats::captures::{FoundPhoto, FoundPhotos, LensAtSize, find, find_in_dir},
+    formats::captures::{
+        FoundPhoto, FoundPhotos, FoundUnposed, LensAtSize, find, find_in_dir, find_unposed,
+        find_unposed_in_dir,
+    },
     limits::Limits,
     photo_label as label,
-    scene::{Camera, Photo, PosedPhoto, Warning, WarningCode, unless_cancelled},
+    scene::{
+        Camera, CamerasMode, CamerasReport, Photo, PosedPhoto, SceneCamera, SolvedCamera, Warning,
+        WarningCode, unless_cancelled,
+    },
 };
 
 /// Photos of the largest size that are decoded at the same time, some 7 bytes a pixel each.
@@ -91,6 +100,53 @@ pub fn read_dir_until(
     let masks = masks.into_iter().map(|(name, bytes)| UploadFile { name, bytes });
     photos.extend(cameras.into_iter().chain(masks));
     Ok((read, Upload { photos, ..Upload::default() }))
+}
+
+/// The photos of an upload whose cameras are to be solved; `None` where it has cameras that count.
+///
+/// # Errors
+/// As [`read`]; `cancelled`.
+pub fn read_unposed(
+    upload: &Upload,
+    mode: CamerasMode,
+    limits: &Limits,
+    cancel: &AtomicBool,
+) -> Result<Option<ReadUnposed>> {
+    let found = find_unposed(upload, mode, limits)?;
+    found.map(|found| unposed::decoded(&found, limits, cancel)).transpose()
+}
+
+/// As [`read_unposed`], of a folder; also the files that were read as an upload.
+///
+/// # Errors
+/// As there.
+pub fn read_unposed_dir(
+    dir: &Path,
+    mode: CamerasMode,
+    limits: &Limits,
+    cancel: &AtomicBool,
+) -> Result<Option<(ReadUnposed, Upload)>> {
+    let Some(found) = find_unposed_in_dir(dir, mode, limits)? else { return Ok(None) };
+    let read = unposed::decoded(&found, limits, cancel)?;
+    let mut masks = BTreeMap::new();
+    let mut photos = Vec::with_capacity(found.photos.len());
+    for file in found.photos {
+        photos.push(UploadFile { name: file.name, bytes: file.bytes.into_owned() });
+        masks.extend(file.mask.map(|mask| (mask.path, mask.bytes.into_owned())));
+    }
+    photos.extend(masks.into_iter().map(|(name, bytes)| UploadFile { name, bytes }));
+    Ok(Some((read, Upload { photos, ..Upload::default() })))
+}
+
+/// The solved cameras of a scene by the files of their photos, as its record has them.
+pub fn solved<'s>(
+    cameras: &'s [SceneCamera],
+    report: &'s CamerasReport,
+) -> impl Iterator<Item = (&'s str, SolvedCamera)> {
+    let k1 = |file: &str| report.placed.iter().find(|one| one.file == file).map_or(0.0, |p| p.k1);
+    cameras.iter().map(move |of| {
+        (&*of.file, SolvedCamera { camera: of.camera, k1: k1(&of.file) })
+    })
 }
 
 /// A photo whose header is read, and whose pixels are not.
@@ -274,16 +330,31 @@ pub enum SentPixels<'a> {
     Made(Photo),
 }
 
+/// The cameras of a scene whose photos are handed on.
+#[derive(Clone, Copy, Debug)]
+pub struct KnownCameras<'s> {
+    /// Whether the cameras of the upload were used.
+    pub mode: CamerasMode,
+    /// The cameras of the scene.
+    pub cameras: &'s [SceneCamera],
+    /// What is known of them.
+    pub report: &'s CamerasReport,
+}
+
 /// Hands on the photos of an upload in the order of the cameras, one at a time. What need not be
-/// decoded is not.
+/// decoded is not. Photos that came without cameras have those of `known`.
 ///
 /// # Errors
 /// As [`read`], and those of `see`.
 pub fn each(
     upload: &Upload,
+    known: KnownCameras<'_>,
     limits: &Limits,
     mut see: impl FnMut(SentPhoto<'_>) -> Result<()>,
 ) -> Result<()> {
+    if let Some(found) = find_unposed(upload, known.mode, limits)? {
+        return each_solved(&found, known, limits, see);
+    }
     let found = find(upload, limits)?;
     let all = AllUndecoded::new(&found, limits, &AtomicBool::new(false))?;
     for one in &all.photos {
@@ -295,6 +366,23 @@ pub fn each(
             let (PosedPhoto { photo, camera, .. }, _) = one.read(all.side_max, limits)?;
             see(SentPhoto { file, camera, pixels: SentPixels::Made(photo) })?;
         }
+    }
+    Ok(())
+}
+
+/// The photos of solved cameras, in the order of these.
+fn each_solved(
+    found: &FoundUnposed<'_>,
+    known: KnownCameras<'_>,
+    limits: &Limits,
+    mut see: impl FnMut(SentPhoto<'_>) -> Result<()>,
+) -> Result<()> {
+    let all = unposed::Undecoded::all(found, limits)?;
+    let side_max = unposed::side_of(&all, limits);
+    for (name, solved) in solved(known.cameras, known.report) {
+        let Some(one) = all.iter().find(|one| one.file.name == name) else { continue };
+        let made = posed(one.read(side_max, limits)?, &solved);
+        see(SentPhoto { file: name, camera: made.camera, pixels: SentPixels::Made(made.photo) })?;
     }
     Ok(())
 }
