@@ -33,6 +33,7 @@ use std::{
 
 use glam::DVec3;
 
+pub use self::layouts::FIND_CAMERAS;
 pub use self::lens::{Base, Lens, LensAtSize, Sizes, Terms, same_aspect};
 pub use self::masks::FoundMask;
 pub use self::names::decoded as decoded_name;

@@ -15,6 +15,7 @@ use super::{PhotoSet, Pipeline, networks::opened};
 use crate::{
     capture,
     error::{Error, ErrorCode, Result, short},
+    formats::captures::FIND_CAMERAS,
     matching::Descriptors,
     meter,
     models::FeatureNetwork,
@@ -36,8 +37,7 @@ const PLACED_MIN: usize = 2;
 const NAMED_MAX: usize = 4;
 /// What can be done about photos whose cameras are not found.
 const REMEDY: &str = "Take more photos, each of which shows most of what the one before shows, of \
-    a scene with texture; or send cameras with the photos: docs/captures.md says how COLMAP finds \
-    them";
+    things with texture; or send cameras with them";
 
 /// Photos of an upload without cameras.
 #[derive(Clone, Debug)]
@@ -215,7 +215,8 @@ fn confirmed(
         }
     }
     let refused = |why: &str| {
-        let message = format!("cameras: {why}{}. {REMEDY}", named(&left_out));
+        let named = named(&left_out);
+        let message = format!("cameras: {why}{named}. {REMEDY}. Of {FIND_CAMERAS}");
         Error::new(ErrorCode::CamerasUnsolved, message)
     };
     if posed.len() < PLACED_MIN {

@@ -72,7 +72,7 @@ pub(super) fn find(folder: &Folder<'_>) -> Vec<Seen> {
 }
 
 /// What finds the cameras of photos alone; README and docs/captures.md have the same lines.
-pub(super) const FIND_CAMERAS: &str = r#"photos alone: these find cameras (pip install pycolmap):
+pub const FIND_CAMERAS: &str = r#"photos alone: these find cameras (pip install pycolmap):
 pycolmap.extract_features("photos/database.db", "photos/images")
 pycolmap.match_exhaustive("photos/database.db")
 pycolmap.incremental_mapping("photos/database.db", "photos/images", "photos/sparse")
