@@ -4,7 +4,7 @@
     python features.py --random 1 --out DIR
 
 The whole of `XFeat.detectAndCompute` is in the graph: heatmap, non-maximum suppression, the best keypoints and their
-descriptors. Weights are kept in f16 and computed in f32. `fine_matcher`, which this does not need, is left out.
+descriptors. Beyond it keypoints lie between pixels: at the top of the parabola through the logarithms of the heatmap. Weights are kept in f16 and computed in f32. `fine_matcher`, which this does not need, is left out.
 """
 import os
 
@@ -17,8 +17,8 @@ from torch.nn import functional
 from common import arguments, entry, export, hold, prepare, session, write_section
 
 # Keypoints of a photo, the least score of one, and the side of a neighbourhood that has one, pixels.
-COUNT, SCORE_MIN, APART = 2048, 0.05, 5
-SIDE, CELL, DIM = 640, 32, 64
+COUNT, SCORE_MIN, APART = 4096, 0.01, 5
+SIDE, CELL, DIM = 960, 32, 64
 # Of two photos the most similar descriptors match, where their cosine is over this (`XFeat.match`).
 SIMILARITY_MIN = 0.82
 
@@ -50,16 +50,25 @@ class Features(torch.nn.Module):
         logits = net.keypoint_head(functional.pixel_unshuffle(x, 8))
         heat = functional.pixel_shuffle(functional.softmax(logits, 1)[:, :64], 8)
         peak = (heat == functional.max_pool2d(heat, APART, 1, APART // 2)) & (heat > SCORE_MIN)
-        # XFeat gives those of the last row and column no score.
-        rows, columns = peak[0, 0, :-1, :-1].nonzero().T
+        # XFeat gives those of the last row and column no score, and a parabola needs both neighbours.
+        rows, columns = (peak[0, 0, 1:-1, 1:-1].nonzero() + 1).T
         at = torch.stack([columns, rows], 1).float()
         size = torch.stack([torch.as_tensor(images.shape[3]), torch.as_tensor(images.shape[2])]).float()
         score = heat[0, 0, rows, columns] * self.sampled(reliability, at, size, "bilinear")[:, 0]
         most = torch.minimum(torch.as_tensor(COUNT), torch.as_tensor(score.shape[0]))
         score, best = torch.topk(score, most)
-        at = at[best]
+        at, rows, columns = at[best], rows[best], columns[best]
+        logs = heat[0, 0].clamp(min=1e-9).log()
         descriptors = self.sampled(functional.normalize(dense, dim=1), at, size, "bicubic")
-        return at + 0.5, score, functional.normalize(descriptors, dim=1)
+        aside = torch.stack([
+            top(logs[rows, columns - 1], logs[rows, columns], logs[rows, columns + 1]),
+            top(logs[rows - 1, columns], logs[rows, columns], logs[rows + 1, columns])], 1)
+        return at + aside + 0.5, score, functional.normalize(descriptors, dim=1)
+
+
+def top(before, here, after):
+    """Where the parabola through three values at -1, 0 and 1 is highest; `here` is the highest of the three."""
+    return (0.5 * (before - after) / (before - 2 * here + after).clamp(max=-1e-6)).clamp(-0.5, 0.5)
 
 
 def half_weights(path):
@@ -87,8 +96,9 @@ def check(theirs, path, sizes):
         image = functional.interpolate(coarse, (height, width), mode="bilinear") + 0.05 * torch.rand(1, 3, height, width)
         wanted = theirs.detectAndCompute(image, top_k=COUNT, detection_threshold=SCORE_MIN)[0]
         at, _, descriptors = onnx_session.run(None, {"images": image.numpy()})
-        there = {tuple(point): row for point, row in zip(wanted["keypoints"].tolist(), wanted["descriptors"])}
-        both = [(there[tuple(point)], row) for point, row in zip((at - 0.5).tolist(), torch.from_numpy(descriptors)) if tuple(point) in there]
+        there = {tuple(point): row for point, row in zip(wanted["keypoints"].tolist(), wanted["descriptors"]) if min(point) > 0}
+        pixels = (at - 0.5).round().tolist()
+        both = [(there[tuple(point)], row) for point, row in zip(pixels, torch.from_numpy(descriptors)) if tuple(point) in there]
         least = max(len(there), len(at), 1)
         print(f"{width}x{height}: {len(there)} keypoints, {len(at)} of the file")
         hold("keypoints that differ", 1 - len(both) / least, 2e-2)
@@ -128,6 +138,7 @@ cell = {CELL}
 dim = {DIM}
 count = {COUNT}
 similarity_min = {SIMILARITY_MIN}
+resize = "bicubic"
 mean = [0.0, 0.0, 0.0]
 std = [1.0, 1.0, 1.0]
 """)
