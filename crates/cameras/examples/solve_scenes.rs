@@ -77,18 +77,21 @@ fn main() {
             if n > total {
                 continue;
             }
-            let mut sets = Vec::new();
-            for s in 0..starts {
-                if n <= 4 {
-                    let first = (total - n) * s / starts.max(2).saturating_sub(1).max(1);
-                    sets.push((first..first + n).collect::<Vec<_>>());
-                } else {
-                    let step = (total - 1 - s.min((total - n) / 2) * 2) as f64 / (n - 1) as f64;
-                    let set: Vec<usize> = (0..n)
-                        .map(|i| s.min((total - n) / 2) + (i as f64 * step) as usize)
-                        .collect();
-                    sets.push(set);
-                }
+            let mut sets: Vec<Vec<usize>> = Vec::new();
+            if n <= 6 {
+                // Neighbours in order.
+                let last = total - n;
+                sets.extend((0..starts).map(|s| {
+                    let first = if starts == 1 { 0 } else { last * s / (starts - 1) };
+                    (first..first + n).collect()
+                }));
+            } else {
+                // Spread evenly, from several first photos.
+                sets.extend((0..starts).map(|s| {
+                    let first = s.min(total - n);
+                    let step = (total - 1 - first) as f64 / (n - 1) as f64;
+                    (0..n).map(|i| first + (i as f64 * step) as usize).collect()
+                }));
             }
             sets.dedup();
             for set in sets {
@@ -144,7 +147,7 @@ fn run(file: &File, set: &[usize], name: &str, with_focal: bool) {
     let e = solution.evidence;
     println!(
         "{name:20} {:3} {:6} {median:7.2} {max:7.2} {:6.3} | {:5.2} links {} agree {:.2} expl {:.2} \
-         rival {:.2} mirr {:.2} held {} {} angle {:.1} err {:.2} cyc {:.2} miss {:.2} t {seconds:.2}",
+         rival {:.2} mirr {:.2} held {} {} angle {:.1} err {:.2} loops {:.2} miss {:.2} weak {:.2} t {seconds:.2}",
         set.len(),
         placed.len(),
         placed.first().map_or(f64::NAN, |p| p.2),
@@ -158,7 +161,8 @@ fn run(file: &File, set: &[usize], name: &str, with_focal: bool) {
         e.held_median,
         e.angle_deg,
         e.error,
-        e.cycles,
+        e.loops,
         e.missing,
+        e.weakest,
     );
 }

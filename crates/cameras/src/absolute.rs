@@ -65,7 +65,7 @@ pub(crate) fn three_points(points: [Vector3<f64>; 3], rays: [Vector3<f64>; 3]) -
 }
 
 fn error2(pose: &Pose, lens: &Lens, seen: &Seen) -> f64 {
-    let pixel = lens.project(&pose.to_camera(&seen.point));
+    let pixel = lens.project(&pose.seen(&seen.point));
     pixel.map_or(f64::INFINITY, |p| (p - seen.pixel).norm_squared())
 }
 
@@ -80,7 +80,7 @@ fn refine(pose: &Pose, lens: &Lens, all: &[Seen], t2: f64, steps: usize) -> Pose
         let mut hessian = Matrix6::zeros();
         let mut gradient = Vector6::zeros();
         for seen in all {
-            let point = pose.to_camera(&seen.point);
+            let point = pose.seen(&seen.point);
             let Some((pixel, by_point, _)) = lens.derivatives(&point) else { continue };
             let rest = seen.pixel - pixel;
             let e2 = rest.norm_squared();
@@ -172,7 +172,7 @@ mod tests {
             let seen: Vec<Seen> = (0..150)
                 .map(|i| {
                     let point = Vector3::new(draw(), draw(), draw());
-                    let mut pixel = lens.project(&truth.to_camera(&point)).expect("in front");
+                    let mut pixel = lens.project(&truth.seen(&point)).expect("in front");
                     if i % 3 != 0 {
                         pixel = Vector2::new(300.0 * draw(), 200.0 * draw());
                     }

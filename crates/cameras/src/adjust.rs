@@ -22,6 +22,8 @@ pub(crate) struct LensPrior {
     /// Focal length, pixels, and the spread of its logarithm.
     pub(crate) focal: f64,
     pub(crate) log_spread: f64,
+    /// Whether the focal length is from EXIF.
+    pub(crate) known: bool,
     /// Spread of k1 about 0.
     pub(crate) k1_spread: f64,
 }
@@ -70,7 +72,7 @@ impl Bundle {
         for (point, sights) in self.points.iter().zip(&self.sights) {
             for sight in sights {
                 let lens = self.lenses[self.lens_of[sight.camera]];
-                let seen = lens.project(&self.poses[sight.camera].to_camera(point));
+                let seen = lens.project(&self.poses[sight.camera].seen(point));
                 // Behind the camera: as far off as 100 px.
                 let e2 = seen.map_or(1e4, |p| (p - sight.pixel).norm_squared());
                 sum += s2 * (e2 / s2).ln_1p();
@@ -201,7 +203,7 @@ impl Bundle {
         for sight in sights {
             let pose = &self.poses[sight.camera];
             let lens_index = self.lens_of[sight.camera];
-            let seen = pose.to_camera(point);
+            let seen = pose.seen(point);
             let Some((pixel, by_seen, mut by_lens)) = self.lenses[lens_index].derivatives(&seen)
             else {
                 continue;

@@ -169,11 +169,11 @@ pub(crate) fn essentials(first: [Vector2<f64>; 5], second: [Vector2<f64>; 5]) ->
             *value -= half;
         }
     }
-    for r in 0..3 {
+    for (r, row) in gram.iter().enumerate() {
         for c in 0..3 {
             let mut p = [0.0; 20];
-            for k in 0..3 {
-                quadratic_times_linear(&gram[r][k], &entry[3 * k + c], &mut p, 1.0);
+            for (k, value) in row.iter().enumerate() {
+                quadratic_times_linear(value, &entry[3 * k + c], &mut p, 1.0);
             }
             set_row(1 + 3 * r + c, &p);
         }
@@ -301,7 +301,7 @@ mod tests {
             let mut second = [Vector2::zeros(); 5];
             for i in 0..5 {
                 let p = Vector3::new(draw(), draw(), 4.0 + draw());
-                let q = truth.to_camera(&p);
+                let q = truth.seen(&p);
                 first[i] = Vector2::new(p.x / p.z, p.y / p.z);
                 second[i] = Vector2::new(q.x / q.z, q.y / q.z);
             }

@@ -7,15 +7,24 @@ use crate::{
     absolute::{self, Seen},
     adjust::{AdjustOptions, Bundle, Sight},
     lens::Lens,
-    pose::Pose,
+    pose::{Pose, angle_deg},
     rng::Rng,
-    survey::Survey,
+    survey::{Link, Survey},
     tracks::Sighting,
 };
 
 /// Points that a photo must agree with to be placed, and their share of those that it might see.
 const PLACED_MIN: f64 = 12.0;
-const PLACED_SHARE: f64 = 0.25;
+const PLACED_SHARE: f64 = 0.3;
+/// The share where the strongest link to a placed photo says the same turn, within
+/// [`TURN_MAX_DEG`].
+const CONFIRMED_SHARE: f64 = 0.1;
+const TURN_MAX_DEG: f64 = 10.0;
+/// Links that place a photo by themselves: their share of matches, their matches; and the points that
+/// must agree on the distance.
+const SURE_SHARE: f64 = 0.5;
+const SURE_INLIERS: usize = 60;
+const BY_LINK_MIN: usize = 5;
 /// Angle between two rays to a point, degrees, under which its depth is not known.
 const ANGLE_MIN_DEG: f64 = 1.0;
 /// Cameras from which on the focal length and the radial term move.
@@ -37,22 +46,28 @@ pub(crate) struct Grown {
 pub(crate) struct Grower<'a> {
     pub(crate) survey: &'a Survey,
     pub(crate) tracks: &'a [Vec<Sighting>],
+    pub(crate) links: &'a [Link],
     pub(crate) state: Grown,
 }
 
 impl<'a> Grower<'a> {
-    pub(crate) fn new(survey: &'a Survey, tracks: &'a [Vec<Sighting>], lenses: &[Lens]) -> Self {
+    pub(crate) fn new(
+        survey: &'a Survey,
+        tracks: &'a [Vec<Sighting>],
+        links: &'a [Link],
+        lenses: &[Lens],
+    ) -> Self {
         let state = Grown {
             poses: vec![None; survey.views.len()],
             lenses: lenses.to_vec(),
             points: vec![None; tracks.len()],
             agrees: tracks.iter().map(|track| vec![false; track.len()]).collect(),
         };
-        Self { survey, tracks, state }
+        Self { survey, tracks, links, state }
     }
 
     /// Grows from two photos and the pose of the second from the first.
-    pub(crate) fn from_pair(&mut self, photos: [usize; 2], pose: Pose, seed: u64) {
+    pub(crate) fn grow(&mut self, photos: [usize; 2], pose: Pose, seed: u64) {
         self.state.poses[photos[0]] = Some(Pose::identity());
         self.state.poses[photos[1]] = Some(pose);
         self.triangulate();
@@ -63,12 +78,18 @@ impl<'a> Grower<'a> {
 
     /// Places photos until none fits, then adjusts everything.
     pub(crate) fn place_all(&mut self, seed: u64) {
-        while let Some((photo, pose)) = self.next_photo(seed) {
+        while let Some((photo, pose)) = self.next_photo(seed).or_else(|| self.next_by_link()) {
             self.state.poses[photo] = Some(pose);
             self.triangulate();
             self.adjust(4);
             self.filter();
         }
+        self.settle();
+    }
+
+    /// Adjusts everything to the end and takes out what does not fit.
+    pub(crate) fn settle(&mut self) {
+        self.filter();
         for _ in 0..2 {
             self.triangulate();
             self.adjust(12);
@@ -93,7 +114,7 @@ impl<'a> Grower<'a> {
     fn error2(&self, sighting: Sighting, point: &Vector3<f64>) -> f64 {
         let photo = sighting.0 as usize;
         let Some(pose) = &self.state.poses[photo] else { return f64::INFINITY };
-        let Some(pixel) = self.lens(sighting.0).project(&pose.to_camera(point)) else {
+        let Some(pixel) = self.lens(sighting.0).project(&pose.seen(point)) else {
             return f64::INFINITY;
         };
         let agree = self.survey.views[photo].agree_px;
@@ -145,7 +166,13 @@ impl<'a> Grower<'a> {
             let Some((pose, score)) = absolute::find(&seen, &lens, threshold, &mut rng) else {
                 continue;
             };
-            if score >= PLACED_MIN.max(PLACED_SHARE * seen.len() as f64) {
+            let confirmed = self.confirmed(photo, &pose);
+            let share = match confirmed {
+                Some(true) => CONFIRMED_SHARE,
+                None => PLACED_SHARE,
+                Some(false) => continue,
+            };
+            if score >= PLACED_MIN.max(share * seen.len() as f64) {
                 return Some((photo, pose));
             }
         }
@@ -200,6 +227,75 @@ impl<'a> Grower<'a> {
         let (_, _, point) = best?;
         let agrees = track.iter().map(|s| self.error2(*s, &point) < 1.0).collect();
         Some((point, agrees))
+    }
+
+    /// The photo with the strongest link to a placed one, where too few points for three at a time
+    /// are known: turn and direction by the link, the distance by the points.
+    fn next_by_link(&self) -> Option<(usize, Pose)> {
+        let ends = |link: &'a Link| {
+            let [a, b] = link.photos;
+            match (&self.state.poses[a], &self.state.poses[b]) {
+                (Some(from), None) => Some((link, b, from, link.geometry.pose)),
+                (None, Some(from)) => Some((link, a, from, link.geometry.pose.inverse())),
+                _ => None,
+            }
+        };
+        let sure = |link: &&Link| {
+            link.share >= SURE_SHARE
+                && link.geometry.inliers.len() >= SURE_INLIERS
+                && link.geometry.rotation_share < 0.5
+        };
+        let mut open: Vec<_> = self.links.iter().filter(sure).filter_map(ends).collect();
+        open.sort_by(|a, b| b.0.strength().total_cmp(&a.0.strength()));
+        open.into_iter()
+            .find_map(|(_, photo, from, step)| Some((photo, self.at_distance(photo, from, &step)?)))
+    }
+
+    /// The pose `step` away from a placed one, at the distance that most known points agree with.
+    fn at_distance(&self, photo: usize, from: &Pose, step: &Pose) -> Option<Pose> {
+        let seen = self.seen_by(photo);
+        let lens = self.lens(photo as u32);
+        let at =
+            |distance: f64| Pose { r: step.r * from.r, t: step.r * from.t + step.t * distance };
+        let turned = at(0.0);
+        let threshold = 1.5 * self.survey.views[photo].agree_px;
+        let agree = |pose: &Pose| {
+            let near = |s: &&Seen| {
+                let pixel = lens.project(&pose.seen(&s.point));
+                pixel.is_some_and(|p| (p - s.pixel).norm() < threshold)
+            };
+            seen.iter().filter(near).count()
+        };
+        let by_point = |s: &Seen| {
+            let ray = lens.direction(&s.pixel).push(1.0).normalize();
+            let (still, moving) = (ray.cross(&turned.seen(&s.point)), ray.cross(&step.t));
+            -still.dot(&moving) / moving.norm_squared().max(1e-12)
+        };
+        let (count, pose) = seen
+            .iter()
+            .map(by_point)
+            .filter(|distance| *distance > 0.0)
+            .map(|distance| (agree(&at(distance)), at(distance)))
+            .max_by_key(|(count, _)| *count)?;
+        (count >= BY_LINK_MIN && 4 * count >= seen.len()).then_some(pose)
+    }
+
+    /// Whether the strongest links to placed photos say the same turn; `None` where there is none.
+    fn confirmed(&self, photo: usize, pose: &Pose) -> Option<bool> {
+        let turned = |link: &&Link| {
+            let [a, b] = link.photos;
+            let other = if a == photo { b } else { a };
+            let placed = self.state.poses[other].as_ref()?;
+            let (first, second) = if a == photo { (pose, placed) } else { (placed, pose) };
+            let off = link.geometry.pose.r.transpose() * second.r * first.r.transpose();
+            Some((link.strength(), angle_deg(&off)))
+        };
+        let own = self.links.iter().filter(|link| link.photos.contains(&photo));
+        let mut turns: Vec<(f64, f64)> = own.filter_map(|link| turned(&link)).collect();
+        turns.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let strongest = turns.first()?.0;
+        // One of those that are nearly as strong is enough: a plane has two turns that fit.
+        Some(turns.iter().any(|(strength, off)| *strength > 0.3 * strongest && *off < TURN_MAX_DEG))
     }
 
     fn options(&self, steps: usize) -> AdjustOptions {

@@ -5,12 +5,30 @@ use nalgebra::{Matrix3, Vector3};
 use crate::{
     grow::{Grower, Grown, angle_between},
     pose::{Pose, angle_deg},
-    solver::{Candidate, between, explained, score_of},
-    survey::Survey,
+    solver::{Candidate, between, explained, shares},
+    survey::{Link, Survey},
 };
 
 /// Solutions whose cameras are turned against each other by more than this differ, degrees.
 const DIFFERENT_DEG: f64 = 5.0;
+
+/// Rays to a point that differ by less see the same side of it, degrees.
+const NEAR_DEG: f64 = 12.0;
+/// Two photos with so many points in common should match.
+const POINTS_IN_BOTH_MIN: usize = 60;
+/// Under this number of near pairs nothing is said of those that did not match.
+const NEAR_PAIRS_MIN: u32 = 3;
+
+/// Confidence in two photos at most: nothing confirms a pair.
+const TWO_PLACED: f64 = 0.4;
+/// Where each kind of doubt halves the confidence; chosen on seven scenes (`docs/adr`, number 71).
+pub(crate) const WEAKEST_MIN: f64 = 0.5;
+const AGREEING_MIN: f64 = 0.75;
+pub(crate) const EXPLAINED_MIN: f64 = 0.8;
+pub(crate) const RIVAL_MAX: f64 = 0.95;
+pub(crate) const MIRRORED_MAX: f64 = 0.95;
+pub(crate) const MISSING_MAX: f64 = 0.7;
+const HELD_MIN: f64 = 25.0;
 
 /// What speaks for a solution and against it.
 #[derive(Clone, Copy, Debug, Default)]
@@ -33,10 +51,14 @@ pub struct Evidence {
     pub angle_deg: f64,
     /// Median distance of keypoints from their points, in units of the distance at which they agree.
     pub error: f64,
-    /// Share of placed photos that hang together by links without any single photo.
-    pub cycles: f64,
-    /// Share of the pairs that should match by the solution and do not.
+    /// Share of the loops of three such pairs whose turns close, within 5 degrees. 1 where there is
+    /// no loop.
+    pub loops: f64,
+    /// Share of the pairs of near cameras that see the same points by the solution, but did not
+    /// match.
     pub missing: f64,
+    /// Largest share of a pair's matches that the cameras explain, in the photo where it is least.
+    pub weakest: f64,
     /// Photos placed.
     pub placed: usize,
 }
@@ -65,7 +87,7 @@ pub(crate) fn mirrored(survey: &Survey, best: &Candidate) -> Option<Grown> {
     // World axes of the reference camera, origin in the middle of the points.
     let to_frame = |p: &Vector3<f64>| reference.r * (p - middle);
     let flip = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, -1.0));
-    let mut grower = Grower::new(survey, &best.tracks, &best.grown.lenses);
+    let mut grower = Grower::new(survey, &best.tracks, &[], &best.grown.lenses);
     grower.state = best.grown.clone();
     for point in grower.state.points.iter_mut().flatten() {
         *point = flip * to_frame(point);
@@ -84,12 +106,43 @@ pub(crate) fn mirrored(survey: &Survey, best: &Candidate) -> Option<Grown> {
     (grower.placed() >= 2).then_some(grower.state)
 }
 
-/// The evidence for the first of the candidates; `others` are the rest.
-pub(crate) fn evidence(survey: &Survey, best: &Candidate, others: &[&Grown]) -> Evidence {
+/// A number that goes from 0 to 1 about `middle`, nearly all of it within three times `width`.
+fn rising(value: f64, middle: f64, width: f64) -> f64 {
+    1.0 / (1.0 + ((middle - value) / width).exp())
+}
+
+/// The confidence that the evidence gives: the product of what each kind of doubt leaves.
+pub(crate) fn confidence(evidence: &Evidence) -> f64 {
+    if evidence.placed < 2 {
+        return 0.0;
+    }
+    let few =
+        if evidence.placed == 2 { TWO_PLACED } else { rising(evidence.held as f64, HELD_MIN, 6.0) };
+    few * rising(evidence.weakest, WEAKEST_MIN, 0.03)
+        * rising(evidence.agreeing, AGREEING_MIN, 0.05)
+        * rising(evidence.explained, EXPLAINED_MIN, 0.03)
+        * rising(-evidence.rival, -RIVAL_MAX, 0.015)
+        * rising(-evidence.mirrored, -MIRRORED_MAX, 0.015)
+        * rising(-evidence.missing, -MISSING_MAX, 0.05)
+}
+
+/// Sightings that agree with their points.
+fn fit(grown: &Grown) -> f64 {
+    grown.agrees.iter().flatten().filter(|agrees| **agrees).count() as f64
+}
+
+/// The evidence for a solution; `relinked` are the links under its lenses, `others` the other
+/// solutions.
+pub(crate) fn evidence(
+    survey: &Survey,
+    best: &Candidate,
+    relinked: &[Link],
+    others: &[Grown],
+) -> Evidence {
     let grown = &best.grown;
-    let score = score_of(survey, &best.links, grown).max(1.0);
+    let own_fit = fit(grown).max(1.0);
     let (mut links, mut all, mut agreeing, mut inliers, mut near) = (0, 0.0, 0.0, 0.0, 0.0);
-    for link in &best.links {
+    for link in relinked {
         let [a, b] = link.photos;
         let (Some(first), Some(second)) = (&grown.poses[a], &grown.poses[b]) else { continue };
         let Some((seen, own)) = explained(survey, link, grown) else { continue };
@@ -105,11 +158,11 @@ pub(crate) fn evidence(survey: &Survey, best: &Candidate, others: &[&Grown]) -> 
     let rival = others
         .iter()
         .filter(|other| difference_deg(grown, other).is_some_and(|angle| angle > DIFFERENT_DEG))
-        .map(|other| score_of(survey, &best.links, other) / score)
+        .map(|other| fit(other) / own_fit)
         .fold(0.0, f64::max);
     let mirrored = mirrored(survey, best)
         .filter(|other| difference_deg(grown, other).is_some_and(|angle| angle > DIFFERENT_DEG))
-        .map_or(0.0, |other| score_of(survey, &best.links, &other) / score);
+        .map_or(0.0, |other| fit(&other) / own_fit);
     let mut held = vec![0; grown.poses.len()];
     let mut angles = Vec::new();
     let mut errors = Vec::new();
@@ -127,7 +180,7 @@ pub(crate) fn evidence(survey: &Survey, best: &Candidate, others: &[&Grown]) -> 
                 let photo = s.0 as usize;
                 let view = &survey.views[photo];
                 let pose = grown.poses[photo].as_ref()?;
-                let pixel = grown.lenses[view.lens].project(&pose.to_camera(point))?;
+                let pixel = grown.lenses[view.lens].project(&pose.seen(point))?;
                 errors.push((pixel - view.pixels[s.1 as usize]).norm() / view.agree_px);
                 Some((point - pose.center()).normalize())
             })
@@ -159,8 +212,83 @@ pub(crate) fn evidence(survey: &Survey, best: &Candidate, others: &[&Grown]) -> 
         held_median: of_placed.get(of_placed.len() / 2).copied().unwrap_or(0),
         angle_deg: median(&mut angles),
         error: median(&mut errors),
-        cycles: 0.0,
-        missing: 0.0,
+        loops: loops(grown, relinked),
+        missing: missing(survey, best, relinked),
+        weakest: shares(survey, relinked, grown)
+            .iter()
+            .zip(&grown.poses)
+            .filter(|(_, pose)| pose.is_some())
+            .map(|(share, _)| *share)
+            .fold(1.0, f64::min),
         placed: of_placed.len(),
     }
+}
+
+/// Share of loops of three links between placed photos whose turns close.
+fn loops(grown: &Grown, links: &[Link]) -> f64 {
+    let count = grown.poses.len();
+    let mut turns: Vec<Option<Matrix3<f64>>> = vec![None; count * count];
+    for link in links {
+        let [a, b] = link.photos;
+        if grown.poses[a].is_some() && grown.poses[b].is_some() {
+            turns[a * count + b] = Some(link.geometry.pose.r);
+            turns[b * count + a] = Some(link.geometry.pose.r.transpose());
+        }
+    }
+    let (mut all, mut closed) = (0, 0);
+    for a in 0..count {
+        for b in a + 1..count {
+            let Some(ab) = turns[a * count + b] else { continue };
+            for c in b + 1..count {
+                if let (Some(bc), Some(ca)) = (turns[b * count + c], turns[c * count + a]) {
+                    all += 1;
+                    closed += usize::from(angle_deg(&(ca * bc * ab)) < DIFFERENT_DEG);
+                }
+            }
+        }
+    }
+    if all == 0 { 1.0 } else { f64::from(closed as u32) / f64::from(all) }
+}
+
+/// Share of pairs of near cameras with many points in both photos that are no links.
+fn missing(survey: &Survey, best: &Candidate, links: &[Link]) -> f64 {
+    let grown = &best.grown;
+    let linked: std::collections::BTreeSet<usize> = links.iter().map(|link| link.pair).collect();
+    let (mut near, mut lost) = (0, 0);
+    for (index, pair) in survey.pairs.iter().enumerate() {
+        let [a, b] = pair.photos;
+        let (Some(first), Some(second)) = (&grown.poses[a], &grown.poses[b]) else { continue };
+        let both = points_in_both(survey, best, [(a, first), (b, second)]);
+        if both >= POINTS_IN_BOTH_MIN {
+            near += 1;
+            lost += usize::from(!linked.contains(&index));
+        }
+    }
+    if near < NEAR_PAIRS_MIN { 0.0 } else { lost as f64 / f64::from(near) }
+}
+
+/// Points, seen by one of the two photos, that both could see from nearly the same side.
+fn points_in_both(survey: &Survey, best: &Candidate, ends: [(usize, &Pose); 2]) -> usize {
+    let grown = &best.grown;
+    let tracks = best.tracks.iter().zip(&grown.agrees).zip(&grown.points);
+    let seen = tracks.filter(|((track, agrees), point)| {
+        let Some(point) = point else { return false };
+        let own = track.iter().zip(*agrees);
+        let by_one = own
+            .filter(|(_, agrees)| **agrees)
+            .any(|(s, _)| ends.iter().any(|(photo, _)| *photo == s.0 as usize));
+        let inside = |(photo, pose): (usize, &Pose)| {
+            let view = &survey.views[photo];
+            let pixel = grown.lenses[view.lens].project(&pose.seen(point));
+            pixel.is_some_and(|p| p.x.abs() < 0.5 * view.size[0] && p.y.abs() < 0.5 * view.size[1])
+        };
+        let rays = ends.map(|(_, pose)| (point - pose.center()).normalize());
+        let lengths = ends.map(|(_, pose)| (point - pose.center()).norm());
+        let scale = lengths[0] / lengths[1];
+        by_one
+            && ends.into_iter().all(inside)
+            && angle_between(&rays[0], &rays[1]) < NEAR_DEG
+            && (0.6..1.7).contains(&scale)
+    });
+    seen.count()
 }

@@ -12,8 +12,10 @@ mod judge;
 mod lens;
 mod pairs;
 mod pose;
+mod report;
 mod rng;
 mod roots;
+mod rotations;
 mod solver;
 mod survey;
 mod tracks;
@@ -149,24 +151,27 @@ pub fn solve(
     let survey = solver::survey(photos, matches, options);
     unless_cancelled(cancel)?;
     progress(0.05);
-    let candidates = solver::candidates(&survey);
-    unless_cancelled(cancel)?;
-    let Some((best, others)) = candidates.split_first() else {
-        let why = "no other photo shows enough of the same things".to_owned();
+    let candidates = solver::candidates(&survey, cancel, progress)?;
+    let mut candidates = candidates.into_iter();
+    let Some(mut best) = candidates.next() else {
+        let left_out = |photo| Placing::LeftOut(report::why_left_out(&survey, photo, &[]));
         return Ok(Solution {
-            photos: vec![Placing::LeftOut(why); photos.len()],
+            photos: (0..photos.len()).map(left_out).collect(),
             points: Vec::new(),
             confidence: 0.0,
             evidence: Evidence::default(),
             warnings: vec!["no two photos show enough of the same things".to_owned()],
         });
     };
-    let others: Vec<&grow::Grown> = others.iter().map(|other| &other.grown).collect();
-    let evidence = judge::evidence(&survey, best, &others);
-    let why_not = |_: usize| "too few points".to_owned();
-    let (placings, points) = world::outcome(photos, &survey, best, why_not)?;
+    let (links, dropped) = solver::drop_weak(&survey, &mut best);
+    let others: Vec<grow::Grown> = candidates.map(|other| other.grown).collect();
+    let evidence = judge::evidence(&survey, &best, &links, &others);
+    let why_not = |photo| report::why_left_out(&survey, photo, &dropped);
+    let (placings, points) = world::outcome(photos, &survey, &best, why_not)?;
+    let confidence = judge::confidence(&evidence);
+    let warnings = report::warnings(&survey, &best.grown, &placings, &evidence, confidence);
     progress(1.0);
-    Ok(Solution { photos: placings, points, confidence: 1.0, evidence, warnings: Vec::new() })
+    Ok(Solution { photos: placings, points, confidence, evidence, warnings })
 }
 
 /// Refuses numbers that are not finite or out of range, and more of them than the options allow.

@@ -14,8 +14,13 @@ impl Pose {
         Self { r: Matrix3::identity(), t: Vector3::zeros() }
     }
 
-    pub(crate) fn to_camera(&self, world: &Vector3<f64>) -> Vector3<f64> {
+    pub(crate) fn seen(&self, world: &Vector3<f64>) -> Vector3<f64> {
         self.r * world + self.t
+    }
+
+    pub(crate) fn inverse(&self) -> Self {
+        let r = self.r.transpose();
+        Self { r, t: -(r * self.t) }
     }
 
     pub(crate) fn center(&self) -> Vector3<f64> {
@@ -67,12 +72,15 @@ pub(crate) fn best_rotation(
     pairs: impl Iterator<Item = (Vector3<f64>, Vector3<f64>)>,
 ) -> Option<Matrix3<f64>> {
     let sum = pairs.fold(Matrix3::zeros(), |sum, (from, to)| sum + to * from.transpose());
-    let svd = sum.try_svd(true, true, 1e-14, 100)?;
+    project(&sum)
+}
+
+/// The rotation nearest to a matrix; `None` where several are equally near.
+pub(crate) fn project(matrix: &Matrix3<f64>) -> Option<Matrix3<f64>> {
+    let svd = matrix.try_svd(true, true, 1e-14, 100)?;
     let (u, v_t) = (svd.u?, svd.v_t?);
-    let sign = (u * v_t).determinant().signum();
-    let mut order = [0, 1, 2];
-    order.sort_by(|&a, &b| svd.singular_values[b].total_cmp(&svd.singular_values[a]));
-    let mut flip = Vector3::repeat(1.0);
-    flip[order[2]] = sign;
-    (svd.singular_values[order[1]] > 1e-9).then(|| u * Matrix3::from_diagonal(&flip) * v_t)
+    // nalgebra orders the singular values from the largest down.
+    let flip = Vector3::new(1.0, 1.0, (u * v_t).determinant().signum());
+    (svd.singular_values[1] > 1e-9 * svd.singular_values[0])
+        .then(|| u * Matrix3::from_diagonal(&flip) * v_t)
 }

@@ -1,7 +1,10 @@
 //! The order of the work: lenses, pairs, focal length, growing from several pairs, and the choice.
 
+use std::sync::atomic::AtomicBool;
+
 use nalgebra::Vector2;
 use rayon::prelude::*;
+use segsplat_core::{error::Result, scene::unless_cancelled};
 
 use crate::{
     PairMatches, PhotoKeypoints, SolveOptions,
@@ -9,6 +12,7 @@ use crate::{
     grow::{Grower, Grown},
     lens::Lens,
     pose::Pose,
+    rotations,
     survey::{Link, Pair, Survey, View},
     tracks::{self, Sighting},
     two_view,
@@ -26,6 +30,9 @@ const SEEDS: usize = 4;
 /// A pair is a link of the view graph where chance gives so many such agreements at most.
 const LOG_CHANCE_MAX: f64 = -8.0;
 const LINK_INLIERS_MIN: usize = 15;
+/// A photo is held by a pair of which the cameras explain this share at least. Photos that only look
+/// alike agree in a third of their matches by the outline of things.
+const WEAK_SHARE: f64 = 0.42;
 
 /// A solution and what it was made from.
 pub(crate) struct Candidate {
@@ -55,6 +62,7 @@ pub(crate) fn survey(
             priors.push(LensPrior {
                 focal: photo.focal.unwrap_or(FOCAL_USUAL * side),
                 log_spread: if focal.is_some() { FOCAL_EXIF_SPREAD } else { FOCAL_USUAL_SPREAD },
+                known: focal.is_some(),
                 k1_spread: K1_SPREAD,
             });
             keys.len() - 1
@@ -62,7 +70,13 @@ pub(crate) fn survey(
         let middle = Vector2::new(f64::from(photo.size[0]), f64::from(photo.size[1])) * 0.5;
         let pixels =
             photo.keypoints.iter().map(|k| Vector2::new(k[0].into(), k[1].into()) - middle);
-        views.push(View { lens, pixels: pixels.collect(), agree_px: View::agree_px(side), side });
+        views.push(View {
+            lens,
+            pixels: pixels.collect(),
+            agree_px: View::agree_px(side),
+            side,
+            size: photo.size.map(f64::from),
+        });
     }
     let pairs = matches.iter().map(|given| {
         let mut order: Vec<usize> = (0..given.pairs.len()).collect();
@@ -79,23 +93,86 @@ fn is_link(link: &Link) -> bool {
 }
 
 /// All candidates, the best first.
-pub(crate) fn candidates(survey: &Survey) -> Vec<Candidate> {
+///
+/// # Errors
+/// `cancelled`.
+pub(crate) fn candidates(
+    survey: &Survey,
+    cancel: &AtomicBool,
+    progress: &(dyn Fn(f64) + Sync),
+) -> Result<Vec<Candidate>> {
     let known: Vec<Lens> = survey.priors.iter().map(|p| Lens { focal: p.focal, k1: 0.0 }).collect();
     let first = survey.links(&known, usize::MAX, None);
+    unless_cancelled(cancel)?;
+    progress(0.4);
     let mut all = Vec::new();
     for lenses in lenses_to_try(survey, &known, &first) {
+        unless_cancelled(cancel)?;
+        progress(0.6);
         let links = survey.links(&lenses, 60, Some(&first));
         let links: Vec<Link> = links.into_iter().flatten().filter(is_link).collect();
-        all.extend(grow_from_pairs(survey, &lenses, links));
+        let links = rotations::consistent(survey.views.len(), &links);
+        all.extend(grow_from_pairs(survey, &lenses, &links));
     }
     all.sort_by(|a, b| b.score.total_cmp(&a.score));
-    all
+    unless_cancelled(cancel)?;
+    progress(0.9);
+    Ok(all)
+}
+
+/// Takes photos out of a solution that no pair holds: in which the cameras explain less than
+/// [`WEAK_SHARE`] of the matches with any other photo. Returns the links under the final lenses and
+/// the photos that were taken out.
+pub(crate) fn drop_weak(survey: &Survey, best: &mut Candidate) -> (Vec<Link>, Vec<usize>) {
+    let mut dropped = Vec::new();
+    loop {
+        let links = links_under(survey, best);
+        let shares = shares(survey, &links, &best.grown);
+        let weak: Vec<usize> = (0..shares.len())
+            .filter(|&i| best.grown.poses[i].is_some() && shares[i] < WEAK_SHARE)
+            .collect();
+        let placed = best.grown.poses.iter().flatten().count();
+        // Where most are weak, none is worse than the others: the confidence says it.
+        if weak.is_empty() || 2 * weak.len() > placed {
+            return (links, dropped);
+        }
+        let mut grower = Grower::new(survey, &best.tracks, &[], &best.grown.lenses);
+        grower.state = best.grown.clone();
+        for photo in &weak {
+            grower.state.poses[*photo] = None;
+        }
+        grower.settle();
+        best.grown = grower.state;
+        dropped.extend(weak);
+    }
+}
+
+/// For each photo the largest share of a pair's matches that the cameras explain.
+pub(crate) fn shares(survey: &Survey, links: &[Link], grown: &Grown) -> Vec<f64> {
+    let mut shares = vec![0.0_f64; grown.poses.len()];
+    for link in links {
+        let Some((seen, _)) = explained(survey, link, grown) else { continue };
+        let share = seen / survey.pairs[link.pair].matches.len() as f64;
+        for photo in link.photos {
+            shares[photo] = shares[photo].max(share);
+        }
+    }
+    shares
+}
+
+/// The links under the lenses that a solution found.
+fn links_under(survey: &Survey, best: &Candidate) -> Vec<Link> {
+    let mut before: Vec<Option<Link>> = vec![None; survey.pairs.len()];
+    for link in &best.links {
+        before[link.pair] = Some(link.clone());
+    }
+    let links = survey.links(&best.grown.lenses, 60, Some(&before));
+    links.into_iter().flatten().filter(is_link).collect()
 }
 
 /// Lenses with the focal lengths under which the pairs agree best.
 fn lenses_to_try(survey: &Survey, known: &[Lens], first: &[Option<Link>]) -> Vec<Vec<Lens>> {
-    let searched: Vec<bool> =
-        survey.priors.iter().map(|p| p.log_spread > FOCAL_EXIF_SPREAD).collect();
+    let searched: Vec<bool> = survey.priors.iter().map(|p| !p.known).collect();
     if !searched.contains(&true) {
         return vec![known.to_vec()];
     }
@@ -132,7 +209,7 @@ fn lenses_to_try(survey: &Survey, known: &[Lens], first: &[Option<Link>]) -> Vec
 }
 
 /// Solutions from several first pairs.
-fn grow_from_pairs(survey: &Survey, lenses: &[Lens], links: Vec<Link>) -> Vec<Candidate> {
+fn grow_from_pairs(survey: &Survey, lenses: &[Lens], links: &[Link]) -> Vec<Candidate> {
     let counts: Vec<usize> = survey.views.iter().map(|v| v.pixels.len()).collect();
     let mut order: Vec<&Link> = links.iter().collect();
     order.sort_by(|a, b| b.geometry.score.total_cmp(&a.geometry.score).then(a.pair.cmp(&b.pair)));
@@ -145,16 +222,16 @@ fn grow_from_pairs(survey: &Survey, lenses: &[Lens], links: Vec<Link>) -> Vec<Ca
         })
     });
     let tracks = tracks::join(&counts, sightings);
-    let seeds = first_pairs(&links);
+    let seeds = first_pairs(links);
     let grown: Vec<Candidate> = seeds
         .par_iter()
         .filter_map(|link| {
-            let mut grower = Grower::new(survey, &tracks, lenses);
-            grower.from_pair(link.photos, link.geometry.pose, survey.seed);
+            let mut grower = Grower::new(survey, &tracks, links, lenses);
+            grower.grow(link.photos, link.geometry.pose, survey.seed);
             (grower.placed() >= 2).then(|| Candidate {
-                score: score_of(survey, &links, &grower.state),
+                score: score_of(survey, links, &grower.state),
                 grown: grower.state,
-                links: links.clone(),
+                links: links.to_vec(),
                 tracks: tracks.clone(),
             })
         })

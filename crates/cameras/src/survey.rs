@@ -23,6 +23,8 @@ pub(crate) struct View {
     /// Distance at which a keypoint still agrees, pixels.
     pub(crate) agree_px: f64,
     pub(crate) side: f64,
+    /// Width and height, pixels.
+    pub(crate) size: [f64; 2],
 }
 
 /// A pair of photos and its matches, the most trusted first.
@@ -48,6 +50,16 @@ pub(crate) struct Link {
     pub(crate) pair: usize,
     pub(crate) photos: [usize; 2],
     pub(crate) geometry: TwoView,
+    /// Share of the matches that agree.
+    pub(crate) share: f64,
+}
+
+impl Link {
+    /// How far the pair is trusted. Photos of different sides of a thing give many matches that
+    /// agree by its outline, but never most of them.
+    pub(crate) fn strength(&self) -> f64 {
+        self.geometry.inliers.len() as f64 * self.share.powi(3)
+    }
 }
 
 impl View {
@@ -96,7 +108,8 @@ impl Survey {
             let (pose, score) =
                 two_view::find(&directions, threshold, samples_max, start, &mut rng)?;
             let geometry = two_view::describe(pose, score, &directions, threshold, &mut rng);
-            Some(Link { pair: index, photos: pair.photos, geometry })
+            let share = geometry.inliers.len() as f64 / pair.matches.len() as f64;
+            Some(Link { pair: index, photos: pair.photos, geometry, share })
         };
         self.pairs.par_iter().enumerate().map(of).collect()
     }

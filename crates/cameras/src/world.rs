@@ -94,7 +94,7 @@ pub(crate) fn outcome(
             let photo = sighting.0 as usize;
             let view = &survey.views[photo];
             let Some(pose) = &grown.poses[photo] else { continue };
-            let Some(pixel) = grown.lenses[view.lens].project(&pose.to_camera(point)) else {
+            let Some(pixel) = grown.lenses[view.lens].project(&pose.seen(point)) else {
                 continue;
             };
             let error2 = (pixel - view.pixels[sighting.1 as usize]).norm_squared();

@@ -1,0 +1,4 @@
+//! Cameras from generated matches, with exact truth.
+
+mod generated;
+mod solved;
