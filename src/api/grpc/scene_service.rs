@@ -17,7 +17,7 @@ use crate::{
         upload::{UploadBuilder, UploadGuard, check_bundle},
     },
     error::{Error, ErrorCode, Result},
-    scene::{SceneId, Upload, UploadCameras},
+    scene::{CamerasMode, SceneId, Upload, UploadCameras},
     service::{
         CreateScene, Export, PageRequest, PictureKind, SceneStatus, SemanticsMode, ViewSpec,
         ViewTimes, ViewsSpec,

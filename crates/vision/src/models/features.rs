@@ -70,7 +70,8 @@ impl FeatureNetwork {
     /// a number that is not finite.
     pub(super) fn try_out(&self) -> Result<()> {
         for [width, height] in [[96_u32, 64], [64, 128]] {
-            let rgb = (0..width * height * 3).map(|i| (i * i % 251) as u8).collect();
+            let level = |i: u32| u8::try_from(i * i % 251).unwrap_or(0);
+            let rgb = (0..width * height * 3).map(level).collect();
             self.find(&Photo { width, height, rgb, valid: None })?;
         }
         Ok(())

@@ -169,7 +169,7 @@ fn solved(pipeline: &Pipeline, photos: &[UnposedPhoto], watch: Watch<'_>) -> Res
         let found = descriptors[i].matched(&descriptors[j], least);
         let pairs = found.iter().map(|pair| pair.keypoints).collect();
         let scores = found.iter().map(|pair| pair.similarity.clamp(0.0, 1.0)).collect();
-        Ok(PairMatches { photos: [i, j], pairs, scores })
+        Ok::<_, Error>(PairMatches { photos: [i, j], pairs, scores })
     };
     let matches = pipeline.workers.install(|| {
         pairs.par_iter().map(matched).collect::<Result<Vec<PairMatches>>>()
