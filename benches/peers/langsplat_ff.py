@@ -12,8 +12,10 @@ of its mask, a view blends them, and the decoder gives each pixel its feature. B
 one function: LERF's relevancy, cut at 0.5. What differs is the bank against the autoencoder.
 
 `--recipe paper` (the default) trains the autoencoder as SegSplat's paper does: AdamW, 2e-2,
-batches of 2, 2,000 steps. `--recipe langsplat` has LangSplat's own rate, Adam 7e-4, with all
-embeddings in each step; the rows of 2026-11-22 have it.
+batches of 2, 2,000 steps. The paper does not say two of what. Here they are two photos, so with
+`--photos 2` each step has all embeddings; `--recipe paper-embeddings` takes two embeddings, of
+which LangSplat's batch normalisation makes next to nothing. `--recipe langsplat` has LangSplat's
+own rate, Adam 7e-4, with all embeddings in each step; the rows of 2026-11-22 have it.
 
 Needs torch, numpy, onnxruntime, tokenizers, pillow."""
 
@@ -39,7 +41,8 @@ ENCODER = [256, 128, 64, 32, 3]
 DECODER = [16, 32, 64, 128, 256, 256]
 # How the autoencoder is trained: optimiser, rate, embeddings of a step (all: None).
 RECIPES = {
-    "paper": (torch.optim.AdamW, 2e-2, 2),
+    "paper": (torch.optim.AdamW, 2e-2, None),
+    "paper-embeddings": (torch.optim.AdamW, 2e-2, 2),
     "langsplat": (torch.optim.Adam, 7e-4, None),
 }
 
@@ -313,6 +316,8 @@ def main():
     parser.add_argument("--commit", default="")
     parser.add_argument("--machine", default="this machine")
     args = parser.parse_args()
+    if args.recipe == "paper" and args.photos != 2:
+        parser.error(f"a batch of two photos is all of them only with --photos 2, not {args.photos}")
     torch.set_num_threads(args.threads)
     texts, rows = Texts(args.bundle), []
     named = args.only.split(",") if args.only else None

@@ -16,7 +16,8 @@ impl Jobs {
     /// # Errors
     /// `invalid_request`, `photo_unreadable`, `limit_exceeded` where the upload cannot be a scene;
     /// `idempotency_key_reused` when the key was used with others; `overloaded` when the queue is
-    /// full or the server stops.
+    /// full or the server stops; `store_unavailable` where it is not kept, or where earlier scenes
+    /// wait for room.
     pub(crate) fn submit(&self, upload: Upload, mut record: Record) -> Result<SceneId> {
         let (limits, never) = (self.parts.limits.get(), AtomicBool::new(false));
         let read = ReadUpload::of(&upload, &record.options, &limits, &never)?;
@@ -32,6 +33,8 @@ impl Jobs {
         }
         let reserved = self.queue.reserve(SCENE, record.owner.as_deref());
         let place = reserved.map_err(|full| self.overloaded(full))?;
+        // Acknowledged scenes come first: another upload would take the room that they wait for.
+        self.parts.store.has_room()?;
         record.replica = self.replicas.name().map(str::to_owned);
         let id = record.status.id.clone();
         self.replicas.hold(&id);
@@ -135,6 +138,9 @@ impl Jobs {
         }
         // What watches the other replicas may have seen first that it is gone.
         let existed = self.records.remove(id) || removed_here;
+        if !self.kinds.iter().any(|kind| kind.lasts() && self.queue.len(*kind) > 0) {
+            self.parts.store.forget_refused();
+        }
         // Only now: a job that ends meanwhile either is seen here, or sees there that its scene is
         // gone.
         if !self.running.has(id) {

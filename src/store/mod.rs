@@ -112,7 +112,7 @@ impl Store {
         self.shared
     }
 
-    /// Whether what was put last was kept, or something as large since. Never blocks.
+    /// Whether what jobs put was kept, or something as large since. Never blocks.
     pub(crate) fn keeps(&self) -> bool {
         self.objects.keeps()
     }
@@ -121,6 +121,17 @@ impl Store {
     /// Fails with `store_unavailable` where it does not.
     pub(crate) fn probe(&self) -> Result<()> {
         self.objects.probe(Name::from(format!("{PROBE}/{}", new_id()?)))
+    }
+
+    /// Looks whether there is room for what waits for it, before more is taken in.
+    /// Fails with `store_unavailable` where there is not.
+    pub(crate) fn has_room(&self) -> Result<()> {
+        if self.keeps() { Ok(()) } else { self.probe() }
+    }
+
+    /// Nothing waits for room any more.
+    pub(crate) fn forget_refused(&self) {
+        self.objects.forget_refused();
     }
 
     /// Bytes of scenes in memory.
@@ -142,7 +153,7 @@ impl Store {
         let keep = || -> Result<()> {
             let file = upload_file::pack(upload, record)
                 .map_err(|e| Error::internal("the upload cannot be packed").caused_by(e))?;
-            let put = || self.objects.put("keep the upload", of(id, UPLOAD), file);
+            let put = || self.objects.offer("keep the upload", of(id, UPLOAD), file);
             if self.shared {
                 // The record first: the sweep of a replica removes an upload without one.
                 self.announce(record)?;

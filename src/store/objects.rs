@@ -64,7 +64,7 @@ pub(super) struct Objects {
     /// Runs the calls; taken when dropped.
     runtime: Option<Runtime>,
     timeout: Duration,
-    /// Bytes of the last object that was not kept; 0 once as many were kept again.
+    /// Bytes of the largest object that was not kept; 0 once as many were kept again.
     refused: AtomicUsize,
 }
 
@@ -140,8 +140,15 @@ impl Objects {
     pub(super) fn put(&self, what: &str, path: Path, bytes: impl Into<PutPayload>) -> Result<()> {
         let bytes: PutPayload = bytes.into();
         let size = bytes.content_length();
+        self.note(size, self.offer(what, path, bytes))
+    }
+
+    /// As [`Self::put`], of an object whose sender is told where it is not kept: that one was too
+    /// large does not mean that the store keeps no other.
+    pub(super) fn offer(&self, what: &str, path: Path, bytes: impl Into<PutPayload>) -> Result<()> {
+        let bytes: PutPayload = bytes.into();
         let file = self.folder.as_ref().map(|folder| folder.join(path.as_ref()));
-        let kept = self.unless_moved(what).and_then(|()| {
+        self.unless_moved(what).and_then(|()| {
             self.run(what, |store| async move {
                 let mut tries = 0..FOLDER_GONE_MAX;
                 let kept = loop {
@@ -157,14 +164,13 @@ impl Objects {
                 }
                 kept
             })
-        });
-        self.note(size, kept)
+        })
     }
 
     /// Notes whether an object of so many bytes was kept.
     fn note<T>(&self, size: usize, kept: Result<T>) -> Result<T> {
         match &kept {
-            Err(_) => self.refused.store(size.max(1), Ordering::Release),
+            Err(_) => drop(self.refused.fetch_max(size.max(1), Ordering::AcqRel)),
             Ok(_) if size >= self.refused.load(Ordering::Acquire) => {
                 self.refused.store(0, Ordering::Release);
             }
@@ -173,7 +179,7 @@ impl Objects {
         kept
     }
 
-    /// Whether the last object was kept, or one as large since.
+    /// Whether all objects were kept, or one as large as each that was not since.
     pub(super) fn keeps(&self) -> bool {
         self.refused.load(Ordering::Acquire) == 0
     }
@@ -186,8 +192,13 @@ impl Objects {
         let (what, zeros) = ("keep anything", vec![0_u8; size]);
         self.put(what, path.clone(), zeros)?;
         self.delete(what, path)?;
-        self.refused.store(0, Ordering::Release);
+        self.forget_refused();
         Ok(())
+    }
+
+    /// Nothing needs the room any more that there was not.
+    pub(super) fn forget_refused(&self) {
+        self.refused.store(0, Ordering::Release);
     }
 
     /// Keeps an object unless there is one; whether it was kept.

@@ -309,6 +309,49 @@ async fn nobody_waits_while_the_store_forgets_semantics() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn scenes_that_wait_for_room_come_before_new_ones() {
+    let (folder, networks) = (tempfile::tempdir().unwrap(), Arc::new(WallNetworks::default()));
+    networks.hold.store(true, Ordering::Release);
+    let given = Arc::clone(&networks);
+    let (faults, server) = on_faults(folder.path(), |_, parts| parts.scenes = given).await;
+    let create = |seed| CreateScene { wait: None, ..request(seed) };
+    faults.plan(|what, path| {
+        (what == "put" && path.as_ref().ends_with("upload.segsplat")).then_some(Wrong::Full)
+    });
+    let refused = server.service.create_scene(create(1)).await.unwrap_err();
+    assert_eq!(refused.code(), ErrorCode::StoreUnavailable, "{refused}");
+    let ready = crate::common::client().get(server.url("/readyz")).send().await.unwrap();
+    assert_eq!(ready.status(), 200, "one upload too many says nothing of others");
+    // Room for an upload, none for a scene.
+    faults.plan(|what, path| {
+        let large =
+            path.as_ref().ends_with("scene.segsplat") || path.as_ref().starts_with("probe/");
+        (what == "put" && large).then_some(Wrong::Full)
+    });
+    let id = server.service.create_scene(create(2)).await.unwrap().status.id;
+    networks.hold.store(false, Ordering::Release);
+    eventually("the scene waits for room, and others are refused", async || {
+        let other = server.service.create_scene(create(3)).await;
+        match other.map_err(|error| error.code()) {
+            Err(code) => {
+                assert_eq!(code, ErrorCode::StoreUnavailable);
+                Some(())
+            }
+            Ok(other) => {
+                server.service.delete(&other.status.id).await.expect("it is there");
+                None
+            }
+        }
+    })
+    .await;
+    assert_eq!(server.service.get(&id).await.unwrap().state, SceneState::Queued);
+    server.service.delete(&id).await.expect("it is there");
+    faults.plan(|_, _| None);
+    let last = server.service.create_scene(create(4)).await.expect("nothing waits any more");
+    assert_eq!(server.finished(&last.status.id).await.state, SceneState::Done);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_scene_that_was_taken_waits_while_the_disk_is_full_and_is_made_after() {
     let (folder, networks) = (tempfile::tempdir().unwrap(), Arc::new(WallNetworks::default()));
     networks.hold.store(true, Ordering::Release);

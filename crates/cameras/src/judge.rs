@@ -5,8 +5,10 @@ use nalgebra::{Matrix3, Vector3};
 use crate::{
     grow::{Grower, Grown, angle_between},
     pose::{Pose, angle_deg},
+    solution::Evidence,
     solver::{Candidate, between, explained, shares},
     survey::{Link, Survey},
+    tracks::Sighting,
 };
 
 /// Solutions whose cameras are turned against each other by more than this differ, degrees.
@@ -27,41 +29,12 @@ const AGREEING_MIN: f64 = 0.75;
 pub(crate) const EXPLAINED_MIN: f64 = 0.8;
 pub(crate) const RIVAL_MAX: f64 = 0.95;
 pub(crate) const MIRRORED_MAX: f64 = 0.95;
-pub(crate) const MISSING_MAX: f64 = 0.7;
+pub(crate) const MISSING_MAX: f64 = 0.55;
+pub(crate) const LOOPS_MIN: f64 = 0.15;
+/// Photos from which on the links of a photo are counted, and how many there must be.
+pub(crate) const CHAIN_PLACED: usize = 8;
+pub(crate) const CHAIN_LINKS: f64 = 1.5;
 const HELD_MIN: f64 = 25.0;
-
-/// What speaks for a solution and against it.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Evidence {
-    /// Pairs of placed photos whose matches fit one geometry of two views.
-    pub links: usize,
-    /// Share of these pairs, by their matches, that are turned as the cameras are, within 5 degrees.
-    pub agreeing: f64,
-    /// Share of the matches of these pairs that the cameras explain.
-    pub explained: f64,
-    /// Matches that the best other solution explains, as a share of those of this one.
-    pub rival: f64,
-    /// The same of the mirrored solution: the scene inside out.
-    pub mirrored: f64,
-    /// Points that three photos or more see, in the photo that sees fewest of them.
-    pub held: usize,
-    /// The same in the median photo.
-    pub held_median: usize,
-    /// Median of the widest angle at which a point is seen, degrees.
-    pub angle_deg: f64,
-    /// Median distance of keypoints from their points, in units of the distance at which they agree.
-    pub error: f64,
-    /// Share of the loops of three such pairs whose turns close, within 5 degrees. 1 where there is
-    /// no loop.
-    pub loops: f64,
-    /// Share of the pairs of near cameras that see the same points by the solution, but did not
-    /// match.
-    pub missing: f64,
-    /// Largest share of a pair's matches that the cameras explain, in the photo where it is least.
-    pub weakest: f64,
-    /// Photos placed.
-    pub placed: usize,
-}
 
 /// Angles between the rotations of two solutions, over the pairs of photos that both place: the
 /// median, degrees.
@@ -102,7 +75,6 @@ pub(crate) fn mirrored(survey: &Survey, best: &Candidate) -> Option<Grown> {
         grower.filter();
         grower.triangulate();
     }
-    grower.place_all(survey.seed);
     (grower.placed() >= 2).then_some(grower.state)
 }
 
@@ -118,17 +90,25 @@ pub(crate) fn confidence(evidence: &Evidence) -> f64 {
     }
     let few =
         if evidence.placed == 2 { TWO_PLACED } else { rising(evidence.held as f64, HELD_MIN, 6.0) };
-    few * rising(evidence.weakest, WEAKEST_MIN, 0.03)
+    // A long chain without loops adds up its errors, and nothing shows them.
+    let links = evidence.links as f64 / (evidence.placed - 1) as f64;
+    let held = if evidence.placed < CHAIN_PLACED { 1.0 } else { rising(links, CHAIN_LINKS, 0.1) };
+    few * held
+        * rising(evidence.loops, LOOPS_MIN, 0.03)
+        * rising(evidence.weakest, WEAKEST_MIN, 0.03)
         * rising(evidence.agreeing, AGREEING_MIN, 0.05)
         * rising(evidence.explained, EXPLAINED_MIN, 0.03)
         * rising(-evidence.rival, -RIVAL_MAX, 0.015)
         * rising(-evidence.mirrored, -MIRRORED_MAX, 0.015)
-        * rising(-evidence.missing, -MISSING_MAX, 0.05)
+        * rising(-evidence.missing, -MISSING_MAX, 0.03)
 }
 
-/// Sightings that agree with their points.
-fn fit(grown: &Grown) -> f64 {
-    grown.agrees.iter().flatten().filter(|agrees| **agrees).count() as f64
+/// Sightings that agree with their points, in photos that `best` placed.
+fn fit(best: &Candidate, grown: &Grown, tracks: &[Vec<Sighting>]) -> f64 {
+    let sightings = tracks.iter().flatten().zip(grown.agrees.iter().flatten());
+    let near = sightings
+        .filter(|(sighting, agrees)| **agrees && best.grown.poses[sighting.0 as usize].is_some());
+    near.count() as f64
 }
 
 /// The evidence for a solution; `relinked` are the links under its lenses, `others` the other
@@ -137,10 +117,10 @@ pub(crate) fn evidence(
     survey: &Survey,
     best: &Candidate,
     relinked: &[Link],
-    others: &[Grown],
+    others: &[Candidate],
 ) -> Evidence {
     let grown = &best.grown;
-    let own_fit = fit(grown).max(1.0);
+    let own_fit = fit(best, grown, &best.tracks).max(1.0);
     let (mut links, mut all, mut agreeing, mut inliers, mut near) = (0, 0.0, 0.0, 0.0, 0.0);
     for link in relinked {
         let [a, b] = link.photos;
@@ -157,12 +137,14 @@ pub(crate) fn evidence(
     }
     let rival = others
         .iter()
-        .filter(|other| difference_deg(grown, other).is_some_and(|angle| angle > DIFFERENT_DEG))
-        .map(|other| fit(other) / own_fit)
+        .filter(|other| {
+            difference_deg(grown, &other.grown).is_some_and(|angle| angle > DIFFERENT_DEG)
+        })
+        .map(|other| fit(best, &other.grown, &other.tracks) / own_fit)
         .fold(0.0, f64::max);
     let mirrored = mirrored(survey, best)
         .filter(|other| difference_deg(grown, other).is_some_and(|angle| angle > DIFFERENT_DEG))
-        .map_or(0.0, |other| fit(&other) / own_fit);
+        .map_or(0.0, |other| fit(best, &other, &best.tracks) / own_fit);
     let mut held = vec![0; grown.poses.len()];
     let mut angles = Vec::new();
     let mut errors = Vec::new();

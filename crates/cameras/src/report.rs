@@ -1,9 +1,12 @@
 //! What is said of a solution in words.
 
 use crate::{
-    CONFIDENCE_MIN, Evidence, Placing,
     grow::Grown,
-    judge::{EXPLAINED_MIN, MIRRORED_MAX, MISSING_MAX, RIVAL_MAX, WEAKEST_MIN},
+    judge::{
+        CHAIN_LINKS, CHAIN_PLACED, EXPLAINED_MIN, LOOPS_MIN, MIRRORED_MAX, MISSING_MAX, RIVAL_MAX,
+        WEAKEST_MIN,
+    },
+    solution::{CONFIDENCE_MIN, Evidence, Placing},
     survey::Survey,
 };
 
@@ -72,6 +75,12 @@ fn doubt(evidence: &Evidence) -> &'static str {
     } else if evidence.weakest < WEAKEST_MIN || evidence.explained < EXPLAINED_MIN {
         "many matches contradict the cameras: the photos may show different sides of a thing that \
          looks alike"
+    } else if evidence.loops < LOOPS_MIN {
+        "the pairs of photos contradict each other around every loop"
+    } else if evidence.placed >= CHAIN_PLACED
+        && (evidence.links as f64) < CHAIN_LINKS * (evidence.placed - 1) as f64
+    {
+        "most photos match only their neighbours: errors add up along the row, take more photos"
     } else if evidence.missing > MISSING_MAX {
         "photos that should show the same things by the cameras do not look alike"
     } else {

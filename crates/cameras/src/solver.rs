@@ -7,8 +7,8 @@ use rayon::prelude::*;
 use segsplat_core::{error::Result, scene::unless_cancelled};
 
 use crate::{
-    PairMatches, PhotoKeypoints, SolveOptions,
     adjust::LensPrior,
+    given::{PairMatches, PhotoKeypoints, SolveOptions},
     grow::{Grower, Grown},
     lens::Lens,
     pose::Pose,

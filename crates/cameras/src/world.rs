@@ -8,7 +8,11 @@ use segsplat_core::{
 };
 
 use crate::{
-    PhotoKeypoints, Placed, Placing, SeenPoint, pose::Pose, solver::Candidate, survey::Survey,
+    given::PhotoKeypoints,
+    pose::Pose,
+    solution::{Placed, Placing, SeenPoint},
+    solver::Candidate,
+    survey::Survey,
 };
 
 /// A similarity of the world: `scale * turn * (X - origin)`.

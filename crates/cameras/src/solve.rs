@@ -1,0 +1,56 @@
+//! From what was given to a solution.
+
+use std::sync::atomic::AtomicBool;
+
+use segsplat_core::{error::Result, scene::unless_cancelled};
+
+use crate::{
+    given::{PairMatches, PhotoKeypoints, SolveOptions, check},
+    judge, report,
+    solution::{Evidence, Placing, Solution},
+    solver, world,
+};
+
+/// Finds the cameras of photos.
+///
+/// `matches` has each pair of photos at most once, in any order; pairs that were tried and did not
+/// match are given with few or no pairs of keypoints: they are evidence too. `progress` gets shares
+/// of the work, 0..1.
+///
+/// # Errors
+/// `invalid_request` for numbers that are not finite or out of range, `limit_exceeded` for more
+/// photos or keypoints than the options allow, `cancelled`. Photos that cannot be placed are no
+/// error: all of them may be left out.
+pub fn solve(
+    photos: &[PhotoKeypoints],
+    matches: &[PairMatches],
+    options: &SolveOptions,
+    cancel: &AtomicBool,
+    progress: &(dyn Fn(f64) + Sync),
+) -> Result<Solution> {
+    check(photos, matches, options)?;
+    let survey = solver::survey(photos, matches, options);
+    unless_cancelled(cancel)?;
+    progress(0.05);
+    let candidates = solver::candidates(&survey, cancel, progress)?;
+    let mut candidates = candidates.into_iter();
+    let Some(mut best) = candidates.next() else {
+        let left_out = |photo| Placing::LeftOut(report::why_left_out(&survey, photo, &[]));
+        return Ok(Solution {
+            photos: (0..photos.len()).map(left_out).collect(),
+            points: Vec::new(),
+            confidence: 0.0,
+            evidence: Evidence::default(),
+            warnings: vec!["no two photos show enough of the same things".to_owned()],
+        });
+    };
+    let (links, dropped) = solver::drop_weak(&survey, &mut best);
+    let others: Vec<solver::Candidate> = candidates.collect();
+    let evidence = judge::evidence(&survey, &best, &links, &others);
+    let why_not = |photo| report::why_left_out(&survey, photo, &dropped);
+    let (placings, points) = world::outcome(photos, &survey, &best, why_not)?;
+    let confidence = judge::confidence(&evidence);
+    let warnings = report::warnings(&survey, &best.grown, &placings, &evidence, confidence);
+    progress(1.0);
+    Ok(Solution { photos: placings, points, confidence, evidence, warnings })
+}
