@@ -129,8 +129,8 @@ options! {
         /// Scenes made at the same time, each on its share of the threads; 0: one for each four
         /// threads, and one at a time in a network [default: 0]
         "SEGSPLAT_JOBS" jobs: usize = 0,
-        /// Whether finished scenes are refined where the create call does not say: on a GPU where
-        /// there are photos enough, never, or for so many milliseconds [default: auto]
+        /// Whether finished scenes are refined where the create call does not say: where there are
+        /// photos enough, never, or for so many milliseconds [default: auto]
         #[arg(value_name = "auto|off|MILLISECONDS")]
         "SEGSPLAT_REFINE" refine: Refine = Refine::Auto,
         /// File of API keys (TOML, made by `segsplat keys new`); read again at SIGHUP

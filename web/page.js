@@ -763,6 +763,9 @@ async function open(id, camera, words = []) {
   for (const warning of scene.report.warnings) blame(warning.message);
   await load(id, camera);
   about(scene.report);
+  if (scene.refinement.state === 'running') {
+    followVersions(id, scene.version, signal).catch(() => {});
+  }
   for (const b of $('scenes').querySelectorAll('button'))
     b.setAttribute('aria-current', String(b.dataset.id === id));
   for (const word of words) await find(word);
@@ -789,6 +792,51 @@ async function load(id, camera) {
     if (!signal.aborted) $('progress').hidden = true;
   }
   say(`${shown()}, ${((performance.now() - begun) / 1000).toFixed(1)} s`);
+}
+
+// Shows the better versions of a scene that is refined, after the one of the number `shown`.
+async function followVersions(id, shown, signal) {
+  let newest = shown,
+    taking = false;
+  const takeNewest = async () => {
+    if (taking) return;
+    taking = true;
+    while (shown < newest && !signal.aborted) {
+      shown = newest;
+      await takeVersion(id, signal);
+    }
+    taking = false;
+  };
+  const told = ({ event, version }) => {
+    if (event !== 'version') return;
+    newest = version;
+    takeNewest().catch(failed);
+  };
+  await server.watch(id, told, signal, true);
+}
+
+// Takes a version in place of the one that is shown, once it is here whole: camera and words stay.
+async function takeVersion(id, signal) {
+  const answer = await server.call(`/v1/scenes/${id}/export?format=packed`, { signal });
+  const parts = [];
+  let head = null;
+  const header = await readPacked(
+    answer.body,
+    (...all) => {
+      head = all;
+      return all[2];
+    },
+    (first, words) => parts.push([first, words]),
+  );
+  if (signal.aborted || state.filming) return;
+  state.scene = header;
+  const taken = drawing.begin(...head);
+  for (const [first, words] of parts) {
+    if (first < taken) drawing.append(first, words.slice(0, 8 * (taken - first)));
+  }
+  if (state.words.length) showWords();
+  invalidate();
+  say(`A better version: ${shown()}`);
 }
 
 // How many Gaussians there are, and which of them where the device has no room for all.

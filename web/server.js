@@ -63,8 +63,8 @@ const server = {
   },
 
   // Server-sent events of a scene, by fetch: EventSource cannot send a key. Ends when it is made or
-  // will not be: what follows are better versions of one that is refined.
-  async watch(id, event, signal) {
+  // will not be; with `versions` it goes on with the better ones of a scene that is refined.
+  async watch(id, event, signal, versions = false) {
     const answer = await this.call(`/v1/scenes/${id}/events`, { signal });
     const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
     let text = '';
@@ -79,7 +79,8 @@ const server = {
         if (!data.length) continue;
         const told = JSON.parse(data.map((line) => line.slice(5)).join('\n'));
         event(told);
-        if (['done', 'failed', 'cancelled'].includes(told.event)) return reader.cancel();
+        const over = ['done', 'failed', 'cancelled'].includes(told.event);
+        if (over && !versions) return reader.cancel();
       }
     }
   },

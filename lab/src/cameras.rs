@@ -49,8 +49,12 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         };
         let never = AtomicBool::new(false);
         let watch = Watch { progress: &|_, _| (), cancel: &never };
-        let read =
-            photo_files::read_unposed(&capture.upload, CamerasMode::Solve, &Limits::default(), &never)?;
+        let read = photo_files::read_unposed(
+            &capture.upload,
+            CamerasMode::Solve,
+            &Limits::default(),
+            &never,
+        )?;
         let photos = read.map(|read| read.photos).unwrap_or_default();
         let begun = Instant::now();
         let found = judged(&engine, &photos, watch)?;

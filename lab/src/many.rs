@@ -4,13 +4,9 @@
 //! Every sixth photo from the fourth is a target. N of the others, spread evenly, are given. Views
 //! are whole photos of one set of Gaussians over the backdrop, without layers.
 
-use std::{
-    path::PathBuf,
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{path::PathBuf, sync::Arc, time::Instant};
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::{
     error::{Error, Result},
@@ -18,8 +14,11 @@ use crate::{
     limits::Limits,
     metrics::{clamped, psnr, ssim},
     photo_files,
-    pipeline::{Pipeline, refinement::refined},
-    refine::{held_out, split},
+    pipeline::{
+        Pipeline,
+        refinement::{RefineCalls, refined},
+    },
+    refine::{RefinedVersion, held_out},
     refinements::Variant,
     render::{
         Background, Frame, Kinds, RenderRequest, Switches,
@@ -27,8 +26,8 @@ use crate::{
         train::unit,
     },
     rows::{Rows, ms, progress},
-    scene::{Camera, Gaussians, PosedPhoto, SceneOptions},
-    scenes::{is_posed, make_for_refinement, scene_of, use_of, view_request},
+    scene::{Camera, Gaussians, PosedPhoto, Scene, SceneOptions},
+    scenes::{is_posed, make_for_refinement, make_keeping, scene_of, use_of, view_request},
     setup::Inputs,
 };
 
@@ -73,17 +72,10 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             return Err(Error::invalid(format!("{name}: {} photos are too few", all.len())));
         }
         let begun = Instant::now();
-        let whole = make_for_refinement(&engine, &given, &scene_options)?;
-        let (scene, first) = (scene_of(whole.0.clone()), whole.1.clone());
+        let (made, seen) = make_keeping(&engine, &given, &scene_options)?;
+        let scene = scene_of(made);
         let create_ms = ms(begun);
-        // Once for all variants, whose time it is no part of.
-        let part = match variants.is_empty() {
-            true => whole.clone(),
-            false => {
-                let (learnt, _) = split(&given, &held_out(given.len()));
-                make_for_refinement(&engine, &learnt, &scene_options)?
-            }
-        };
+        let (_, first) = make_for_refinement(&engine, &given, &[], &seen)?;
         let one_set = |gaussians: &Gaussians, camera| {
             let near = default_near(scene.meta.report.median_depth);
             let background = Background::Backdrop(Arc::clone(&scene.backdrop));
@@ -129,13 +121,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         }
         for (text, variant) in &variants {
             let mut row = plain.clone();
-            let mut rested = Duration::ZERO;
-            let mut remake = |photos: Vec<PosedPhoto>| {
-                let known = if photos.len() == given.len() { &whole } else { &part };
-                let rest = Duration::from_millis(variant.networks_ms);
-                std::thread::sleep(rest);
-                rested += rest;
-                Ok(variant.start(known.clone()))
+            let mut remake = |held: &[usize]| {
+                Ok(variant.start(make_for_refinement(&engine, &given, held, &seen)?))
             };
             let mut paces = 0_u32;
             let mut pace = |_: f32| {
@@ -143,9 +130,16 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
                 Ok(())
             };
             let (begun, cpu) = (Instant::now(), cpu_seconds());
+            // When each version came, and the version.
+            let mut versions: Vec<(f64, RefinedVersion)> = Vec::new();
+            let mut publish = |_: &Scene, version: &RefinedVersion| {
+                versions.push((ms(begun), version.clone()));
+                Ok(())
+            };
             let (options, renderer) = (variant.options(), &*renderer);
-            let found = refined(renderer, &scene, &given, &options, &mut remake, &mut pace)?;
-            let refine_ms = ms(begun) - rested.as_secs_f64() * 1e3;
+            let calls = RefineCalls { remake: &mut remake, pace: &mut pace, publish: &mut publish };
+            let found = refined(renderer, &scene, &given, &options, calls)?;
+            let refine_ms = ms(begun);
             row["refine"] = json!(text);
             row["asked_s"] = json!(variant.asked_s());
             row["refine_ms"] = json!(refine_ms);
@@ -159,7 +153,13 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             row["own_psnr_after"] = json!(found.report.psnr_after);
             // Where no version was better, what is served stays.
             row["refined_psnr"] = plain["served_psnr"].clone();
-            if let Some((_, version)) = &found.version {
+            let came = |(ms, version): &(f64, RefinedVersion)| {
+                Ok(
+                    json!({ "ms": ms, "psnr": judge(&version.gaussians)?, "report": version.report }),
+                )
+            };
+            row["versions"] = versions.iter().map(came).collect::<Result<Value>>()?;
+            if let Some((_, version)) = versions.last() {
                 row["refined_psnr"] = json!(judge(&version.gaussians)?);
                 row["refined_gaussians"] = json!(version.gaussians.len());
                 row["refined_ssim"] = json!(similarity(&version.gaussians)?);

@@ -16,15 +16,16 @@ use crate::{
     metrics::{clamped, psnr, ssim},
     pipeline::{
         Pipeline,
-        refinement::{refined, version_of},
+        refinement::{RefineCalls, refined, version_of},
     },
+    refine::RefinedVersion,
     refinements::Variant,
     render::{Kinds, Renderer, cpu::CpuRenderer, plan::served, train::unit},
     rows::{Rows, each, means, ms, progress},
     scene::{PosedPhoto, Preset, Scene, SceneOptions},
     scenes::{
-        SIDE, is_posed, make, make_for_refinement, means_by_use, scene_of, squares, use_of,
-        view_request,
+        SIDE, is_posed, make, make_for_refinement, make_keeping, means_by_use, scene_of, squares,
+        use_of, view_request,
     },
     setup::Inputs,
     triples::{Triple, triples},
@@ -73,9 +74,6 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let options = SceneOptions { preset: args.preset, ..SceneOptions::default() };
     let options = options.with(&args.method)?;
     let refinement = args.refine.as_deref().map(str::parse::<Variant>).transpose()?;
-    if refinement.as_ref().is_some_and(|variant| variant.networks_ms > 0) {
-        return Err(Error::invalid("refine: networks_ms is of `many`; here the networks run"));
-    }
     let method = (photos, &options, refinement.as_ref());
     let mut scenes = Vec::new();
     for (name, dir) in args.inputs.find(is_posed)? {
@@ -160,15 +158,20 @@ fn judge(
         "total_ms": total_ms,
     });
     if let Some(variant) = refinement {
-        let mut remake = |photos: Vec<PosedPhoto>| {
-            Ok(variant.start(make_for_refinement(engine, &photos, options)?))
+        let seen = make_keeping(engine, &given, options)?.1;
+        let mut remake =
+            |held: &[usize]| Ok(variant.start(make_for_refinement(engine, &given, held, &seen)?));
+        let mut best = None;
+        let mut publish = |start: &Scene, version: &RefinedVersion| {
+            best = Some(version_of(start, &scene, version)?);
+            Ok(())
         };
-        let found =
-            refined(renderer, &scene, &given, &variant.options(), &mut remake, &mut |_| Ok(()))?;
+        let pace = &mut |_| Ok(());
+        let calls = RefineCalls { remake: &mut remake, pace, publish: &mut publish };
+        refined(renderer, &scene, &given, &variant.options(), calls)?;
         row["refined_psnr"] = row["psnr"].clone();
-        if let Some((start, version)) = &found.version {
-            let refined = view(&version_of(start, &scene, version)?)?;
-            row["refined_psnr"] = json!(psnr(&clamped(refined.color), &truth, valid));
+        if let Some(version) = &best {
+            row["refined_psnr"] = json!(psnr(&clamped(view(version)?.color), &truth, valid));
         }
     }
     let mut pictures: grid::Row = given.iter().map(|posed| grid::photo(&posed.photo)).collect();

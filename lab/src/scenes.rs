@@ -11,7 +11,7 @@ use crate::{
     limits::Limits,
     models::{ResizeFilter, fit},
     photo_files,
-    pipeline::{Pipeline, Reconstruction, reconstruct, reconstruct_for_refinement},
+    pipeline::{self, PhotoSet, Pipeline, Reconstruction, Seen, reconstruct},
     render::{Kinds, RenderRequest, plan::default_near},
     rows::means,
     scene::{
@@ -154,15 +154,28 @@ pub(crate) fn make(
     reconstruct(engine, photos, options, &|_, _| (), &AtomicBool::new(false))
 }
 
-/// As [`make`], and the one set of Gaussians with which refinement begins.
-pub(crate) fn make_for_refinement(
+/// As [`make`], and what the network said of the photos.
+pub(crate) fn make_keeping(
     engine: &Pipeline,
     photos: &[PosedPhoto],
     options: &SceneOptions,
-) -> Result<(Reconstruction, Gaussians)> {
-    let watch = Watch { progress: &|_, _| (), cancel: &AtomicBool::new(false) };
-    reconstruct_for_refinement(engine, photos, options, watch)
+) -> Result<(Reconstruction, Seen)> {
+    let photos = PhotoSet { photos: photos.to_vec(), warnings: Vec::new(), read_ms: 0.0 };
+    pipeline::make_keeping(engine, &photos, options, SILENT)
 }
+
+/// What a refinement without the photos `held` begins with: the scene and its one set.
+pub(crate) fn make_for_refinement(
+    engine: &Pipeline,
+    photos: &[PosedPhoto],
+    held: &[usize],
+    seen: &Seen,
+) -> Result<(Reconstruction, Gaussians)> {
+    pipeline::make_for_refinement(engine, photos, held, seen, SILENT)
+}
+
+static NEVER: AtomicBool = AtomicBool::new(false);
+const SILENT: Watch<'static> = Watch { progress: &|_, _| (), cancel: &NEVER };
 
 /// A scene that is not stored.
 pub(crate) fn scene_of(reconstruction: Reconstruction) -> Scene {

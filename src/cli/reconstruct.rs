@@ -23,15 +23,16 @@ use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
     formats::table::ExportFormat,
-    jobs::{budget_ms, refine_options, refiner},
+    jobs::{Refiner, refine_options},
     names::named,
     pipeline::{
-        self, PhotoSet, Pipeline, ReadSet, cameras, reconstruct_for_refinement,
-        refinement::{refined, reported, version_of},
+        self, PhotoSet, Pipeline, ReadSet, Seen, cameras, make_for_refinement,
+        refinement::{RefineCalls, refined, reported, version_of},
         semantics::{SemanticsInput, understand},
     },
+    refine::{RefineOptions, RefinedVersion},
     scene::{
-        CamerasMode, Density, PhotoHash, PosedPhoto, Preset, Provenance, Refine, RefineReport, Scene, SceneId,
+        CamerasMode, Density, PhotoHash, Preset, Provenance, Refine, RefineReport, Scene, SceneId,
         SceneMeta, SceneOptions, SemanticsMode, Stage, Upload, Watch,
     },
     service::{check_refine, scene_splats},
@@ -106,13 +107,28 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         ReadSet::Posed(photos) => photos,
         ReadSet::Unposed(photos) => cameras::posed(&engine, photos, watch)?,
     };
-    let made = pipeline::make(&engine, &photos, &options, watch)?;
+    let refiner = match args.refine {
+        Refine::Off => None,
+        _ => {
+            let device = engine::renderer(config)?.differentiable();
+            let refiner = Refiner::new(device, config.threads, &config.limits)?;
+            let ms = refiner.budget_ms(args.refine, photos.photos.len());
+            ms.map(|ms| (refiner, refine_options(ms, &config.limits)))
+        }
+    };
+    let (made, seen) = match refiner {
+        None => (pipeline::make(&engine, &photos, &options, watch)?, None),
+        Some(_) => {
+            let (made, seen) = pipeline::make_keeping(&engine, &photos, &options, watch)?;
+            (made, Some(seen))
+        }
+    };
     let provenance = store::provenance(store::hashes(&upload), &options, engine.bundle().sha256());
     let id = id_of(&provenance);
     let made = made.into_scene(id, store::now_ms(), provenance);
-    let mut scene = match budget_ms(args.refine, photos.photos.len(), config.threads) {
-        Some(ms) => refine(&engine, made, &photos, ms, &options, config, watch)?,
-        None => made,
+    let mut scene = match (&refiner, &seen) {
+        (Some(refiner), Some(seen)) => refine(&engine, refiner, made, &photos, seen, watch)?,
+        _ => made,
     };
     let for_others = splat_format(&path).is_some();
     write(&path, &scene)?;
@@ -136,32 +152,36 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     describe(&path, &scene, total_ms, out)
 }
 
-/// The scene after so many milliseconds of refinement; as it was where none was better.
+/// The scene after its refinement; as it was where none was better.
 fn refine(
     engine: &Pipeline,
+    (refiner, how): &(Refiner, RefineOptions),
     scene: Scene,
     photos: &PhotoSet,
-    ms: u64,
-    options: &SceneOptions,
-    config: &Config,
+    seen: &Seen,
     watch: Watch<'_>,
 ) -> Result<Scene> {
-    let refiner = refiner(engine::renderer(config)?.differentiable(), config.threads)?;
-    let how = refine_options(ms, &config.limits);
     let silent = Watch { progress: &|_, _| (), cancel: watch.cancel };
-    let mut remake =
-        |photos: Vec<PosedPhoto>| reconstruct_for_refinement(engine, &photos, options, silent);
+    let photos = &photos.photos;
+    let mut remake = |held: &[usize]| make_for_refinement(engine, photos, held, seen, silent);
     let mut pace = |spent: f32| {
         (watch.progress)(Stage::Refine, spent);
         Ok(())
     };
-    let found = refined(&*refiner, &scene, &photos.photos, &how, &mut remake, &mut pace)?;
-    let Some((start, version)) = &found.version else {
-        let mut scene = scene;
-        scene.meta.report.refinement = Some(reported(photos.photos.len(), &found.report));
-        return Ok(scene);
+    let mut best = None;
+    let mut publish = |start: &Scene, version: &RefinedVersion| {
+        best = Some(version_of(start, &scene, version)?);
+        Ok(())
     };
-    version_of(start, &scene, version)
+    let found = refiner.run(|renderer| {
+        let calls = RefineCalls { remake: &mut remake, pace: &mut pace, publish: &mut publish };
+        refined(renderer, &scene, photos, how, calls)
+    })?;
+    Ok(best.unwrap_or_else(|| {
+        let mut scene = scene;
+        scene.meta.report.refinement = Some(reported(photos.len(), &found.report));
+        scene
+    }))
 }
 
 /// A file of Gaussians becomes a scene file. No network is needed.

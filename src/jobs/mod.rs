@@ -5,6 +5,7 @@
 //! store before `Jobs::submit` returns. Out: a scene in the store. Invariant: an acknowledged scene
 //! is made, fails with a code, or is cancelled, over any restart.
 
+mod background;
 mod bell;
 mod change;
 mod job;
@@ -36,7 +37,7 @@ pub use self::networks::{
     NetworkState, NoSemantics, Phrases, PipelineNetworks, SceneNetworks, SemanticNetworks,
 };
 
-pub(crate) use self::refine::{budget_ms, refine_options, refiner};
+pub(crate) use self::refine::{Refiner, refine_options};
 
 pub(crate) use self::shared::{JobParts, Jobs};
 

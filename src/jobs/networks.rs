@@ -6,9 +6,10 @@ use crate::{
     error::{Error, ErrorCode, Result},
     models::Provider,
     pipeline::{
-        self, PhotoSet, Pipeline, PipelineLoader, Reconstruction, UnposedSet,
+        self, PhotoSet, Pipeline, PipelineLoader, Reconstruction, Seen, UnposedSet,
         semantics::{SemanticsInput, label_photos},
     },
+    refine::split,
     scene::{Gaussians, Method, PosedPhoto, Scene, SceneOptions, Semantics, TextEmbedding, Watch},
 };
 
@@ -89,18 +90,37 @@ pub trait SceneNetworks: Send + Sync {
         watch: Watch<'_>,
     ) -> Result<Reconstruction>;
 
-    /// As [`Self::make`], and the Gaussians with which refinement begins: one set of the same
-    /// photos (`front_photos` = 0), or what was made.
+    /// As [`Self::make`], and what the networks said of the photos, where they can be united again
+    /// without them.
+    ///
+    /// # Errors
+    /// As [`Self::make`].
+    fn make_keeping(
+        &self,
+        photos: &PhotoSet,
+        options: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<(Reconstruction, Option<Seen>)> {
+        Ok((self.make(photos, options, watch)?, None))
+    }
+
+    /// The scene of the photos but those of the numbers `held`, and the Gaussians with which its
+    /// refinement begins: one set of the same photos (`front_photos` = 0), or what was made. `seen`
+    /// is what the networks said of all photos, as [`Self::make_keeping`] gave it.
     ///
     /// # Errors
     /// As [`Self::make`].
     fn make_for_refinement(
         &self,
         photos: &PhotoSet,
+        held: &[usize],
+        _seen: Option<&Seen>,
         options: &SceneOptions,
         watch: Watch<'_>,
     ) -> Result<(Reconstruction, Gaussians)> {
-        let made = self.make(photos, options, watch)?;
+        let kept = split(&photos.photos, held).0;
+        let kept = PhotoSet::given(kept, Vec::new(), 0.0);
+        let made = self.make(&kept, options, watch)?;
         let one_set = made.gaussians.clone();
         Ok((made, one_set))
     }
@@ -248,13 +268,27 @@ impl SceneNetworks for PipelineNetworks {
         pipeline::make(self.0.get()?, photos, options, watch)
     }
 
-    fn make_for_refinement(
+    fn make_keeping(
         &self,
         photos: &PhotoSet,
         options: &SceneOptions,
         watch: Watch<'_>,
+    ) -> Result<(Reconstruction, Option<Seen>)> {
+        let (made, seen) = pipeline::make_keeping(self.0.get()?, photos, options, watch)?;
+        Ok((made, Some(seen)))
+    }
+
+    fn make_for_refinement(
+        &self,
+        photos: &PhotoSet,
+        held: &[usize],
+        seen: Option<&Seen>,
+        _options: &SceneOptions,
+        watch: Watch<'_>,
     ) -> Result<(Reconstruction, Gaussians)> {
-        pipeline::reconstruct_for_refinement(self.0.get()?, &photos.photos, options, watch)
+        let lacks = || Error::internal("what the networks said of the photos is not here");
+        let seen = seen.ok_or_else(lacks)?;
+        pipeline::make_for_refinement(self.0.get()?, &photos.photos, held, seen, watch)
     }
 }
 

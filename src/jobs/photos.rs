@@ -12,9 +12,10 @@ use crate::{
     error::{Error, Result},
     formats::table::read_splats,
     limits::Limits,
-    pipeline::{self, PhotoSet, ReadSet, UnposedSet},
+    pipeline::{self, PhotoSet, ReadSet, Seen, UnposedSet},
     scene::{
-        PhotoHash, Scene, SceneId, SceneOptions, SceneStatus, SemanticsMode, Stage, StageTime, Upload,
+        PhotoHash, Scene, SceneId, SceneOptions, SceneStatus, SemanticsMode, Stage, StageTime,
+        Upload,
     },
     store,
 };
@@ -141,6 +142,8 @@ pub(super) struct ReadUploads {
 #[derive(Debug)]
 struct Kept {
     upload: Arc<ReadUpload>,
+    /// What the networks said of its photos, for a refinement that waits.
+    seen: Option<Arc<Seen>>,
     /// End of its time; none where a job waits for it.
     until: Option<Instant>,
 }
@@ -151,7 +154,7 @@ impl Kept {
     }
 
     fn size_bytes(&self) -> u64 {
-        self.upload.size_bytes()
+        self.upload.size_bytes() + self.seen.as_ref().map_or(0, |seen| seen.size_bytes())
     }
 }
 
@@ -163,12 +166,13 @@ impl ReadUploads {
     /// Keeps an upload until it is forgotten, where it fits. Those that wait for a first text make
     /// room, the oldest first.
     pub(super) fn keep(&self, id: &SceneId, upload: Arc<ReadUpload>) {
-        self.insert(id, Kept { upload, until: None });
+        self.insert(id, Kept { upload, seen: None, until: None });
     }
 
     /// Keeps an upload for a first text, where it fits.
     pub(super) fn leave(&self, id: &SceneId, upload: Arc<ReadUpload>) {
-        self.insert(id, Kept { upload, until: Some(Instant::now() + self.left_for) });
+        let until = Some(Instant::now() + self.left_for);
+        self.insert(id, Kept { upload, seen: None, until });
     }
 
     fn insert(&self, id: &SceneId, new: Kept) {
@@ -186,6 +190,23 @@ impl ReadUploads {
             uploads.remove(&oldest);
         }
         uploads.insert(id.clone(), new);
+    }
+
+    /// Keeps what the networks said of the photos beside an upload that is here, where it fits.
+    pub(super) fn keep_seen(&self, id: &SceneId, seen: Seen) {
+        let kept = self.uploads.lock().remove(id);
+        if let Some(kept) = kept {
+            let without = Kept { upload: Arc::clone(&kept.upload), ..kept };
+            self.insert(id, Kept { seen: Some(Arc::new(seen)), ..kept });
+            if self.find(id).is_none() {
+                self.insert(id, without);
+            }
+        }
+    }
+
+    /// Takes what the networks said of the photos.
+    pub(super) fn take_seen(&self, id: &SceneId) -> Option<Arc<Seen>> {
+        self.uploads.lock().get_mut(id)?.seen.take()
     }
 
     pub(super) fn find(&self, id: &SceneId) -> Option<Arc<ReadUpload>> {

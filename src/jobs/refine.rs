@@ -1,9 +1,10 @@
-//! The job that refines a finished scene. The scene is served meanwhile; the better version takes
+//! The job that refines a finished scene. The scene is served meanwhile; each better version takes
 //! its place in one step.
 //!
 //! It goes behind everything else: before each step it waits until no other job waits or runs and
 //! no view was drawn for a moment. Where views never end it has a fourth of the time. It holds no
-//! slot and no room. What it still has to do is in the record, so that a start begins it again.
+//! slot and no room. Where no device draws it has a share of the threads, of the lowest priority.
+//! What it still has to do is in the record, so that a start begins it again.
 
 use std::{
     sync::Arc,
@@ -13,6 +14,7 @@ use std::{
 use parking_lot::Mutex;
 
 use super::{
+    background::background_threads,
     bell::FOREVER,
     change::{Change, forget_refinement},
     job::{Job, Reason},
@@ -22,15 +24,12 @@ use super::{
 use crate::{
     error::Result,
     limits::Limits,
-    pipeline::{
-        PhotoSet,
-        refinement::{refined, reported, version_of},
-    },
+    pipeline::refinement::{RefineCalls, refined, reported, version_of},
     refine::{HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion},
-    render::{DifferentiableRenderer, cpu::CpuRenderer},
+    render::{DifferentiableRenderer, Switches, cpu::CpuRenderer},
     scene::{
-        PosedPhoto, Refine, RefineReport, RefineState, RefineStatus, Scene, SceneError, SceneId,
-        SceneStatus, Stage, Watch,
+        Refine, RefineReport, RefineState, RefineStatus, Scene, SceneError, SceneId, SceneStatus,
+        Stage, Watch,
     },
     store::{Record, RefineOrder},
 };
@@ -38,6 +37,8 @@ use crate::{
 /// Processor time that `auto` takes, and the least and most milliseconds of it.
 const AUTO_CPU_MS: u64 = 120_000;
 const AUTO_MS: [u64; 2] = [10_000, 60_000];
+/// Threads that it has on the processor at least, where there are so many.
+const THREADS_MIN: usize = 2;
 /// Time without views after which it goes on.
 const QUIET: Duration = Duration::from_millis(250);
 /// Where views never end it goes on after so many times the time that it worked, or so long: a
@@ -93,18 +94,52 @@ impl Work for RefineScene {
     }
 }
 
-/// What refines where views are drawn on a device that can, or on none.
-///
-/// # Errors
-/// `internal` when threads cannot be started.
-pub(crate) fn refiner(
-    device: Option<Arc<dyn DifferentiableRenderer>>,
-    threads: usize,
-) -> Result<Arc<dyn DifferentiableRenderer>> {
-    match device {
-        Some(device) => Ok(device),
-        // Threads of its own: a view never waits for a step.
-        None => Ok(Arc::new(CpuRenderer::new(threads)?)),
+/// What refines scenes, and where.
+pub(crate) struct Refiner {
+    renderer: Arc<dyn DifferentiableRenderer>,
+    /// Its threads where no device does the work: others always go first.
+    threads: Option<Arc<rayon::ThreadPool>>,
+    /// Those of the whole process.
+    cores: usize,
+}
+
+impl Refiner {
+    /// On the device where views are drawn on one that can; else on a share of so many `threads`
+    /// ([`Limits::refine_threads_percent`]).
+    ///
+    /// # Errors
+    /// `internal` when threads cannot be started.
+    pub(crate) fn new(
+        device: Option<Arc<dyn DifferentiableRenderer>>,
+        threads: usize,
+        limits: &Limits,
+    ) -> Result<Self> {
+        if let Some(renderer) = device {
+            return Ok(Self { renderer, threads: None, cores: threads });
+        }
+        let cores = threads.max(1);
+        let share = (cores * limits.refine_threads_percent as usize).div_ceil(100);
+        let threads = background_threads(share.clamp(THREADS_MIN.min(cores), cores))?;
+        let renderer = CpuRenderer::on(Arc::clone(&threads), &Switches::default());
+        Ok(Self { renderer: Arc::new(renderer), threads: Some(threads), cores })
+    }
+
+    /// Does `work` where it is to be done, with what draws there.
+    pub(crate) fn run<T: Send>(
+        &self,
+        work: impl FnOnce(&dyn DifferentiableRenderer) -> T + Send,
+    ) -> T {
+        let work = || work(&*self.renderer);
+        match &self.threads {
+            Some(threads) => threads.install(work),
+            None => work(),
+        }
+    }
+
+    /// Milliseconds that a scene of so many photos is to be refined for; `None`: not at all.
+    pub(crate) fn budget_ms(&self, refine: Refine, photos: usize) -> Option<u64> {
+        let own = self.threads.as_ref().map(|threads| threads.current_num_threads());
+        budget_ms(refine, photos, own.unwrap_or(self.cores))
     }
 }
 
@@ -120,8 +155,8 @@ pub(crate) fn refine_options(ms: u64, limits: &Limits) -> RefineOptions {
     }
 }
 
-/// Milliseconds that a scene of so many photos is to be refined for; `None`: not at all.
-pub(crate) fn budget_ms(refine: Refine, photos: usize, threads: usize) -> Option<u64> {
+/// [`Refiner::budget_ms`] on so many threads.
+fn budget_ms(refine: Refine, photos: usize, threads: usize) -> Option<u64> {
     match refine {
         Refine::Off => None,
         Refine::Ms(ms) => Some(ms),
@@ -138,7 +173,7 @@ impl Jobs {
     pub(crate) fn refine(&self, id: &SceneId, how: Refine) -> Result<()> {
         let record = self.record(id)?;
         let photos = record.status.cameras.len();
-        let Some(ms) = budget_ms(how, photos, self.parts.threads) else {
+        let Some(ms) = self.parts.refiner.budget_ms(how, photos) else {
             return self.end_refinement(id);
         };
         if record.refine.is_some() {
@@ -168,10 +203,19 @@ impl Jobs {
         if report.refinement.is_some() || report.file_format.is_some() {
             return None; // a copy of a scene that was refined, or one without photos
         }
-        let how = record.options.refine.unwrap_or(self.parts.refine);
-        let ms = budget_ms(how, scene.meta.cameras.len(), self.parts.threads)?;
+        let ms = self.first_budget_ms(record, scene.meta.cameras.len())?;
         self.queue.reserve(REFINE, record.owner.as_deref()).ok()?;
         Some(RefineOrder { ms, attempts: 0 })
+    }
+
+    /// Whether a scene of so many photos that is being made is to be refined.
+    pub(super) fn is_refined_next(&self, record: &Record, photos: usize) -> bool {
+        self.first_budget_ms(record, photos).is_some()
+    }
+
+    fn first_budget_ms(&self, record: &Record, photos: usize) -> Option<u64> {
+        let how = record.options.refine.unwrap_or(self.parts.refine);
+        self.parts.refiner.budget_ms(how, photos)
     }
 
     /// Where a version was published and its record was not: the record of that version.
@@ -198,11 +242,18 @@ impl Jobs {
         turns.give_way()?;
         let scene = self.parts.store.scene(id)?;
         let upload = self.upload(id, watch)?;
-        let PhotoSet { photos, warnings, .. } = upload.photos()?;
+        let photos = upload.photos()?;
         let options = refine_options(order.ms, &self.parts.limits.get());
-        let mut remake = |photos: Vec<PosedPhoto>| {
-            let photos = PhotoSet::given(photos, warnings.clone(), 0.0);
-            self.parts.scenes.make_for_refinement(&photos, &record.options, watch)
+        let scenes = &self.parts.scenes;
+        // The networks run again where what they said is not here any more.
+        let mut seen = match self.uploads.take_seen(id) {
+            Some(seen) => Some(seen),
+            None => scenes.make_keeping(photos, &record.options, watch)?.1.map(Arc::new),
+        };
+        let mut remake = |held: &[usize]| {
+            // Nothing needs it after all photos.
+            let seen = if held.is_empty() { seen.take() } else { seen.clone() };
+            scenes.make_for_refinement(photos, held, seen.as_deref(), &record.options, watch)
         };
         let mut told = 0.0;
         let mut pace = |spent: f32| {
@@ -212,11 +263,12 @@ impl Jobs {
             }
             turns.give_way()
         };
-        let renderer = &*self.parts.refiner;
-        let found = refined(renderer, &scene, photos, &options, &mut remake, &mut pace)?;
-        if let Some((start, version)) = &found.version {
-            self.publish(job, start, version)?;
-        }
+        let mut publish =
+            |start: &Scene, version: &RefinedVersion| self.publish(job, start, version);
+        let found = self.parts.refiner.run(|renderer| {
+            let calls = RefineCalls { remake: &mut remake, pace: &mut pace, publish: &mut publish };
+            refined(renderer, &scene, &photos.photos, &options, calls)
+        })?;
         self.finish_refinement(job, &found.report)
     }
 
@@ -294,6 +346,17 @@ mod tests {
         assert_eq!([auto(64, 8), auto(64, 64)], [Some(15_000), Some(10_000)]);
         assert_eq!(budget_ms(Refine::Off, 9, 2), None);
         assert_eq!(budget_ms(Refine::Ms(7), 2, 2), Some(7));
+    }
+
+    #[test]
+    fn it_has_a_share_of_the_threads_and_two_where_there_are_two() {
+        let threads = |all: usize, refine_threads_percent: u32| {
+            let limits = Limits { refine_threads_percent, ..Limits::default() };
+            let refiner = Refiner::new(None, all, &limits).expect("threads");
+            refiner.run(|_| rayon::current_num_threads())
+        };
+        assert_eq!([threads(1, 50), threads(2, 50), threads(7, 50)], [1, 2, 4]);
+        assert_eq!([threads(4, 0), threads(4, 100), threads(4, 900)], [2, 4, 4]);
     }
 
     #[test]

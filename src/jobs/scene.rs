@@ -18,8 +18,8 @@ use super::{
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::{
-        CamerasSource, Provenance, Scene, SceneError, SceneId, SceneMeta, SceneState, SceneStatus, SemanticsMode,
-        SemanticsState, SemanticsStatus, Stage, Watch,
+        CamerasSource, Provenance, Scene, SceneError, SceneId, SceneMeta, SceneState, SceneStatus,
+        SemanticsMode, SemanticsState, SemanticsStatus, Stage, Watch,
     },
     store::{self, Record},
     telemetry::{self, meter},
@@ -181,9 +181,20 @@ impl Jobs {
                     }
                 }
                 SemanticsMode::Lazy => self.uploads.leave(id, Arc::clone(&upload)),
+                SemanticsMode::Off if self.is_refined_next(record, photos.photos.len()) => {
+                    self.uploads.leave(id, Arc::clone(&upload));
+                }
                 SemanticsMode::Off => self.uploads.forget(id),
             }
-            let made = self.parts.scenes.make(photos, &record.options, watch)?;
+            let made = match self.is_refined_next(record, photos.photos.len()) {
+                false => self.parts.scenes.make(photos, &record.options, watch)?,
+                true => {
+                    let made = self.parts.scenes.make_keeping(photos, &record.options, watch)?;
+                    let (made, seen) = made;
+                    seen.into_iter().for_each(|seen| self.uploads.keep_seen(id, seen));
+                    made
+                }
+            };
             Ok(made.into_scene(id.clone(), created_ms, provenance))
         })?;
         Ok((Made::New(Box::new(scene)), lock))

@@ -22,12 +22,13 @@ use super::{
     photos::{ReadUpload, ReadUploads},
     queue::{Full, Queue},
     records::Records,
+    refine::Refiner,
     room::Room,
 };
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::LiveLimits,
-    render::{DifferentiableRenderer, Renderer},
+    render::Renderer,
     scene::{Refine, SceneId, SemanticsMode, SemanticsState, Stage, Watch},
     store::{Record, Store, not_found},
 };
@@ -102,9 +103,8 @@ pub(crate) struct JobParts {
     pub(crate) refine: Refine,
     /// What draws scenes: it has a new one before its first view.
     pub(crate) renderer: Arc<dyn Renderer>,
-    /// What refines them, with so many threads of the processor.
-    pub(crate) refiner: Arc<dyn DifferentiableRenderer>,
-    pub(crate) threads: usize,
+    /// What refines them.
+    pub(crate) refiner: Refiner,
     /// How long ago a view was drawn, waited or was encoded; `None`: never.
     pub(crate) since_last_view: Box<dyn Fn() -> Option<Duration> + Send + Sync>,
 }

@@ -13,11 +13,10 @@ use super::{
 use crate::{
     config::Config,
     error::Result,
-    jobs::{JobParts, Jobs, NetworkState, SceneNetworks, SemanticNetworks, refiner},
+    jobs::{JobParts, Jobs, NetworkState, Refiner, SceneNetworks, SemanticNetworks},
     keys::Caller,
     limits::{Limits, LiveLimits},
     render::Renderer,
-    scene::Refine,
     store::{Store, StoreLocation},
 };
 
@@ -114,12 +113,7 @@ impl Service {
         let scheduler = Scheduler::new(parts.renderer.concurrency(), &config.limits);
         let views = Arc::clone(&scheduler);
         let device = Arc::clone(&parts.renderer).differentiable();
-        let refine = match config.refine {
-            // It takes all processors for a minute after each scene, so it is for calls that ask.
-            Refine::Auto if device.is_none() => Refine::Off,
-            how => how,
-        };
-        let refiner = refiner(device, config.threads)?;
+        let refiner = Refiner::new(device, config.threads, &config.limits)?;
         let networks = Arc::clone(&parts.scenes);
         let limits = Arc::new(LiveLimits::new(config.limits.clone()));
         let job_parts = JobParts {
@@ -129,10 +123,9 @@ impl Service {
             limits: Arc::clone(&limits),
             workers: config.workers(),
             keep_photos: config.keep_photos,
-            refine,
+            refine: config.refine,
             renderer: Arc::clone(&parts.renderer),
             refiner,
-            threads: config.threads,
             since_last_view: Box::new(move || views.idle()),
         };
         let jobs = Jobs::start(job_parts, records)?;

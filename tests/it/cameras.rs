@@ -141,10 +141,10 @@ async fn photos_that_cannot_be_solved_are_refused_with_what_to_do() {
     picture.write_to(&mut std::io::Cursor::new(&mut plain), image::ImageFormat::Png).unwrap();
     let plain = (0..4).map(|i| UploadFile { name: format!("{i}.png"), bytes: plain.clone() });
     // Two places.
-    let strangers = [room(2, 1).0.remove(0), UploadFile {
-        name: "other.png".to_owned(),
-        ..room(2, 40).0.remove(0)
-    }];
+    let strangers = [
+        room(2, 1).0.remove(0),
+        UploadFile { name: "other.png".to_owned(), ..room(2, 40).0.remove(0) },
+    ];
     for (photos, named) in [(plain.collect::<Vec<_>>(), "0.png"), (strangers.into(), "other.png")] {
         let status = made(&server, photos).await;
         assert_eq!(status["state"], "failed", "{status}");
@@ -173,10 +173,7 @@ async fn cameras_that_are_wrong_are_solved_where_that_is_asked() {
         })
     });
     let wrong = json!({ "cameras": wrong.collect::<Vec<_>>() }).to_string().into_bytes();
-    let sent = Upload {
-        cameras: Some(UploadCameras::Cameras(wrong)),
-        ..upload(photos.clone())
-    };
+    let sent = Upload { cameras: Some(UploadCameras::Cameras(wrong)), ..upload(photos.clone()) };
     let base = server.url("/v1/scenes?wait_ms=300000");
     // The option in the query, beside the part of the same name; and as a part alone.
     let both = [

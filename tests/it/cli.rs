@@ -292,7 +292,10 @@ fn photos_without_cameras_get_them_and_a_file_of_them() {
     let written: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     let frames = written["frames"].as_array().unwrap();
     assert_eq!(frames.len(), 5);
-    assert_eq!((&frames[0]["w"], &frames[0]["file_path"]), (&json!(480), &json!("images/0000.png")));
+    assert_eq!(
+        (&frames[0]["w"], &frames[0]["file_path"]),
+        (&json!(480), &json!("images/0000.png"))
+    );
     // The file is read as any other, and the photos alone give the same cameras.
     let scene = folder.path().join("x.segsplat");
     let given = ok_json(&["reconstruct", text(&photos), "-o", text(&scene)]);

@@ -1,13 +1,20 @@
 //! Refinement as a job: the scene is served meanwhile, better versions take its place whole, and it
 //! ends with its scene.
 
-use std::sync::{Arc, atomic::Ordering};
+use std::{
+    path::Path,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+};
 
 use futures_util::StreamExt;
 use segsplat::{
+    config::Config,
     error::{ErrorCode, Result},
     jobs::SceneNetworks,
-    pipeline::{PhotoSet, Reconstruction},
+    pipeline::{PhotoSet, Pipeline, Reconstruction, make_for_refinement, make_keeping},
     sample::{self, SampleOptions},
     scene::{
         Event, Refine, RefineState, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode,
@@ -19,6 +26,7 @@ use segsplat::{
 use crate::common::{
     doors::bytes,
     meaning::PhotoMeaning,
+    opened,
     process::eventually,
     server::{PATIENCE, TestServer, WallNetworks, first_view},
 };
@@ -88,6 +96,37 @@ async fn texts(server: &TestServer, id: &SceneId) -> u64 {
         ..QuerySpec::default()
     };
     server.service.query(id, spec).await.expect("texts are answered").results[0].gaussians
+}
+
+#[test]
+fn what_the_network_said_is_united_again_without_some_photos() {
+    let mut config = Config::default();
+    config.bundle = Some(Path::new("tests/fixtures/plane").to_owned());
+    config.threads = 2;
+    let Some(engine) = opened(Pipeline::open(&config.networks())) else { return };
+    let options = SampleOptions { photos: 6, width: 64, height: 48, seed: 5 };
+    let photos = sample::photos(&options).expect("the options are in range");
+    let set = PhotoSet { photos: photos.clone(), warnings: Vec::new(), read_ms: 0.0 };
+    let stop = AtomicBool::new(false);
+    let watch = Watch { progress: &|_, _| (), cancel: &stop };
+    let (made, seen) = make_keeping(&engine, &set, &SceneOptions::default(), watch).expect("made");
+    assert!(seen.size_bytes() > 60 * made.report.gaussians, "{} bytes", seen.size_bytes());
+    let again =
+        |held: &[usize]| make_for_refinement(&engine, &photos, held, &seen, watch).expect("united");
+    let (all, one_set) = again(&[]);
+    assert!(all.gaussians == made.gaussians && all.backdrop == made.backdrop, "the same scene");
+    assert!(one_set.means() != all.gaussians.means(), "one set is made in another way");
+    let (without, one_set) = again(&[1, 4]);
+    let files: Vec<&str> = without.cameras.iter().map(|camera| &*camera.file).collect();
+    let kept = [0, 2, 3, 5].map(|i: usize| &*photos[i].file);
+    assert_eq!(files, kept);
+    assert!(without.cameras.iter().all(|camera| camera.network.is_some()), "all have Gaussians");
+    for gaussians in [&without.gaussians, &one_set] {
+        let views: Vec<u16> = gaussians.source().iter().map(|pixel| pixel.view).collect();
+        assert!((0..4).all(|view| views.contains(&view)) && !views.contains(&4), "their numbers");
+        assert!(gaussians.len() < all.gaussians.len());
+    }
+    assert!(without.backdrop != all.backdrop, "nor their colours behind");
 }
 
 #[tokio::test(flavor = "multi_thread")]

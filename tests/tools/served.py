@@ -28,8 +28,10 @@ def served(
     cwd: Path = ROOT,
     env: dict[str, str] | None = None,
 ) -> Iterator[str]:
-    """The address of a server of its own. Its log is beside its data."""
+    """The address of a server of its own, which refines where a test asks for it. Its log is
+    beside its data."""
     command = [program, "serve", "--listen", "127.0.0.1:0", "--data-dir", data, *flags]
+    env = {"SEGSPLAT_REFINE": "off", **(os.environ if env is None else env)}
     with (
         (data.parent / f"{data.name}.log").open("w") as log,
         subprocess.Popen(

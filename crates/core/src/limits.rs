@@ -190,8 +190,11 @@ limits! {
     scene_timeout_ms: u64 = 600_000;
     /// Milliseconds of work that one refinement may be given.
     refine_ms_max: u64 = 600_000;
-    /// Steps of one refinement: those of ten minutes on 64 cores.
-    refine_steps_max: u32 = 20_000;
+    /// Steps of one refinement: those of some minutes on a GPU.
+    refine_steps_max: u32 = 100_000;
+    /// Share of the threads, percent, that refinements have where no GPU draws; two at least, where
+    /// there are two. All others go first.
+    refine_threads_percent: u32 = 50, restart;
     /// Gaussians that a refinement may end with. It begins with at most 150,000.
     refine_gaussians_max: usize = 1_000_000;
     /// Longer side at which a refinement on a GPU learns photos, pixels; on the processor it is at

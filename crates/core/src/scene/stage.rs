@@ -36,14 +36,8 @@ pub enum Stage {
 
 impl Stage {
     /// Stages of a scene, in order.
-    pub const SCENE: [Self; 6] = [
-        Self::Photos,
-        Self::Cameras,
-        Self::Capture,
-        Self::Geometry,
-        Self::Lift,
-        Self::Store,
-    ];
+    pub const SCENE: [Self; 6] =
+        [Self::Photos, Self::Cameras, Self::Capture, Self::Geometry, Self::Lift, Self::Store];
 
     /// Stages of the semantics of a scene, in order.
     pub const SEMANTICS: [Self; 4] = [Self::Masks, Self::Embed, Self::Bank, Self::Assign];

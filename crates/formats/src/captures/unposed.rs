@@ -8,13 +8,7 @@ use std::{
     path::Path,
 };
 
-use super::{
-    FoundMask, check_count,
-    folder::Folder,
-    layouts,
-    masks::Masks,
-    names, not_read, told,
-};
+use super::{FoundMask, check_count, folder::Folder, layouts, masks::Masks, names, not_read, told};
 use crate::{
     error::{Error, Result},
     limits::Limits,

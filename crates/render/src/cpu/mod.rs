@@ -20,7 +20,7 @@ mod sky;
 pub mod store;
 pub mod tiles;
 
-use std::{borrow::Cow, ops::Range, time::Instant};
+use std::{borrow::Cow, ops::Range, sync::Arc, time::Instant};
 
 use rayon::prelude::*;
 
@@ -61,7 +61,7 @@ const TASKS_A_THREAD: usize = 16;
 /// Renders on the processor with its own threads.
 #[derive(Debug)]
 pub struct CpuRenderer {
-    threads: rayon::ThreadPool,
+    threads: Arc<rayon::ThreadPool>,
     /// Buffers between frames; one set for each frame drawn at the same time.
     frames: Pool<FrameScratch>,
     tiles: Pool<TileScratch>,
@@ -97,15 +97,21 @@ impl CpuRenderer {
                 let why = format!("render: {threads} threads cannot be started");
                 Error::internal(why).caused_by(error)
             })?;
-        Ok(Self {
-            threads: pool,
+        Ok(Self::on(Arc::new(pool), switches))
+    }
+
+    /// A renderer that draws on these threads.
+    #[must_use]
+    pub fn on(threads: Arc<rayon::ThreadPool>, switches: &Switches) -> Self {
+        Self {
+            threads,
             frames: Pool::default(),
             tiles: Pool::default(),
             backwards: Pool::default(),
             blocks: BlockCache::new(blocks_from(switches)),
             isects_max: switches.isects_max().unwrap_or(ISECTS_MAX).into(),
             options: KernelOptions::new(switches),
-        })
+        }
     }
 
     /// The frame, and how long each stage took.

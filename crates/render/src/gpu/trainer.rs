@@ -48,8 +48,7 @@ pub(super) fn trainer_bytes(set: &TrainingSet<'_>) -> u64 {
     let numbers = 3 * set.gaussians.sh_count() as u64;
     let row = size_of::<GaussianRow>() as u64 + 4 * numbers;
     let learnt = gradient_bytes(1, numbers) + moment_bytes(1, numbers);
-    // As they are, and as they were kept.
-    let each = 2 * row + learnt + PAIRS_A_GAUSSIAN * PAIR_BYTES;
+    let each = row + learnt + PAIRS_A_GAUSSIAN * PAIR_BYTES;
     // Pictures, what the loss says of them, and SSIM's windows.
     let pictures = most * 4 * (4 + 4 + 9);
     4 * set.photos.iter().map(pixels).sum::<u64>() + pictures + each * places_of(set) as u64
@@ -91,8 +90,6 @@ pub(super) struct DeviceTrainer {
     scene: DeviceScene,
     /// Places from the first on, behind which none had a Gaussian yet.
     used: usize,
-    /// As they were when they were kept.
-    kept: Option<Kept>,
     training: TrainingBuffers,
     /// Gradients of the photos before the last one of a step; there for steps of several.
     earlier: Option<wgpu::Buffer>,
@@ -104,14 +101,6 @@ pub(super) struct DeviceTrainer {
     plans: [wgpu::Buffer; 2],
     /// The last step, while it is not known whether it had room.
     pending: Option<Pending>,
-}
-
-/// Rows and harmonics of each place, and what came with them.
-#[derive(Clone, Debug)]
-struct Kept {
-    rows: wgpu::Buffer,
-    sh: wgpu::Buffer,
-    origins: Origins,
 }
 
 /// A submission whose plan is not here yet.
@@ -209,7 +198,6 @@ impl DeviceTrainer {
             origins: Origins { source, semantic_index },
             scene,
             used: set.gaussians.len(),
-            kept: None,
             training,
             earlier: None,
             targets,
@@ -333,24 +321,6 @@ impl DeviceTrainer {
         })
     }
 
-    /// The Gaussians of the places that have one.
-    fn read_gaussians(&mut self, Kept { rows, sh, origins }: &Kept) -> Result<Gaussians> {
-        let (rows, sh) = self.read_places(rows, sh)?;
-        let k = self.scene.sh_count as usize;
-        let there: Vec<usize> = (0..rows.len()).filter(|&i| is_there(&rows[i])).collect();
-        checked(RawGaussians {
-            origin: self.origin,
-            means: of_each(&there, |i| rows[i].mean),
-            quats: of_each(&there, |i| rows[i].quat),
-            scales: of_each(&there, |i| rows[i].scale),
-            opacities: of_each(&there, |i| rows[i].opacity),
-            sh_degree: self.sh_degree,
-            sh: there.iter().flat_map(|i| &sh[i * k..(i + 1) * k]).copied().collect(),
-            semantic_index: of_each(&there, |i| origins.semantic_index[i]),
-            source: of_each(&there, |i| origins.source[i]),
-        })
-    }
-
     /// How much each place is to blame for how the scene differs from the photos.
     fn blame(&mut self, photos: &[usize]) -> Result<Vec<f32>> {
         let earlier = self.earlier()?;
@@ -465,39 +435,22 @@ impl Trainer for DeviceTrainer {
 
     fn gaussians(&mut self) -> Result<Gaussians> {
         self.settle()?;
-        let (rows, sh) = (self.scene.gaussians.clone(), self.scene.sh.clone());
-        self.read_gaussians(&Kept { rows, sh, origins: self.origins.clone() })
-    }
-
-    fn keep(&mut self) -> Result<()> {
-        self.settle()?;
-        let places = self.scene.count as usize;
-        let (gpu, sizes, origins) = (&self.on.gpu, self.sizes(places), self.origins.clone());
-        let kept = match self.kept.take() {
-            Some(kept) => Kept { origins, ..kept },
-            None => Kept {
-                rows: gpu.create_buffer("kept rows", sizes[0], STORAGE)?,
-                sh: gpu.create_buffer("kept harmonics", sizes[1], STORAGE)?,
-                origins,
-            },
-        };
-        gpu.scoped("training", || {
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            let now = [&self.scene.gaussians, &self.scene.sh];
-            for ((from, to), bytes) in now.into_iter().zip([&kept.rows, &kept.sh]).zip(sizes) {
-                encoder.copy_buffer_to_buffer(from, 0, to, 0, Some(bytes));
-            }
-            gpu.queue.submit([encoder.finish()]);
-        })?;
-        self.kept = Some(kept);
-        Ok(())
-    }
-
-    fn kept(&mut self) -> Result<Gaussians> {
-        match self.kept.clone() {
-            Some(kept) => self.read_gaussians(&kept),
-            None => self.gaussians(),
-        }
+        let now = self.scene.clone();
+        let (rows, sh) = self.read_places(&now.gaussians, &now.sh)?;
+        let k = now.sh_count as usize;
+        let there: Vec<usize> = (0..rows.len()).filter(|&i| is_there(&rows[i])).collect();
+        let origins = &self.origins;
+        checked(RawGaussians {
+            origin: self.origin,
+            means: of_each(&there, |i| rows[i].mean),
+            quats: of_each(&there, |i| rows[i].quat),
+            scales: of_each(&there, |i| rows[i].scale),
+            opacities: of_each(&there, |i| rows[i].opacity),
+            sh_degree: self.sh_degree,
+            sh: there.iter().flat_map(|i| &sh[i * k..(i + 1) * k]).copied().collect(),
+            semantic_index: of_each(&there, |i| origins.semantic_index[i]),
+            source: of_each(&there, |i| origins.source[i]),
+        })
     }
 
     fn exposures(&mut self) -> Result<Vec<(Exposure, f64)>> {

@@ -65,7 +65,6 @@ impl Target {
 pub struct HostTrainer<'a> {
     renderer: &'a dyn DifferentiableRenderer,
     gaussians: Gaussians,
-    kept: Option<Gaussians>,
     adam: Adam,
     targets: Vec<Target>,
     ssim_share: f32,
@@ -84,7 +83,6 @@ impl<'a> HostTrainer<'a> {
         Ok(Self {
             renderer,
             gaussians: set.gaussians.clone(),
-            kept: None,
             adam: Adam::new(set.gaussians),
             targets: set.photos.par_iter().map(Target::new).collect(),
             ssim_share: set.ssim_share,
@@ -155,15 +153,6 @@ impl Trainer for HostTrainer<'_> {
 
     fn gaussians(&mut self) -> Result<Gaussians> {
         Ok(self.gaussians.clone())
-    }
-
-    fn keep(&mut self) -> Result<()> {
-        self.kept = Some(self.gaussians.clone());
-        Ok(())
-    }
-
-    fn kept(&mut self) -> Result<Gaussians> {
-        Ok(self.kept.as_ref().unwrap_or(&self.gaussians).clone())
     }
 
     fn exposures(&mut self) -> Result<Vec<(Exposure, f64)>> {

@@ -108,19 +108,6 @@ pub trait Trainer {
     /// As [`Self::step`].
     fn gaussians(&mut self) -> Result<Gaussians>;
 
-    /// Keeps the Gaussians as they are now beside those that are moved, in the place of those that
-    /// were kept before.
-    ///
-    /// # Errors
-    /// As [`Self::step`].
-    fn keep(&mut self) -> Result<()>;
-
-    /// The Gaussians that were kept, as [`Self::gaussians`]; as they are now where none were.
-    ///
-    /// # Errors
-    /// As [`Self::step`].
-    fn kept(&mut self) -> Result<Gaussians>;
-
     /// The exposure of each photo, and its loss before its last step: NaN where there was none.
     ///
     /// # Errors

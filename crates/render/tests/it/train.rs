@@ -271,35 +271,6 @@ fn a_step_that_lacks_room_is_taken_once() {
 }
 
 #[test]
-fn what_was_kept_is_not_moved() {
-    let truth = cloud(400, 0, 6);
-    let (photos, start) = (photos(&truth, &[[48, 32]]), disturbed(&truth));
-    let set = set(&start, &photos);
-    let Some(gpu) = both_kernels().next() else { return };
-    let cpu = cpu();
-    let device = gpu.trainer(&set, u64::MAX).expect("room").expect("a trainer");
-    let host = HostTrainer::new(&cpu, &set).expect("a trainer");
-    for (name, mut trainer) in [("device", device), ("host", Box::new(host) as Box<dyn Trainer>)] {
-        let mut take = |keeps: bool| {
-            trainer.step(&[0], &step(0.0)).expect("a step");
-            if keeps {
-                trainer.keep().expect("kept");
-            }
-            let [now, kept] = [trainer.gaussians(), trainer.kept()].map(|it| it.expect("read"));
-            (now.means().to_vec(), kept.means().to_vec())
-        };
-        let (now, kept) = take(false);
-        assert_eq!(now, kept, "{name}: nothing was kept");
-        let (second, kept) = take(true);
-        assert_eq!(second, kept, "{name}: the second step");
-        let (now, kept) = take(false);
-        assert!(now != second && kept == second, "{name}: the third step moved it");
-        let (now, kept) = take(true);
-        assert_eq!(now, kept, "{name}: the fourth step");
-    }
-}
-
-#[test]
 fn odd_input_is_refused_and_nothing_has_no_trainer() {
     let truth = cloud(100, 0, 5);
     let mut photos = photos(&truth, &[[40, 30]]);

@@ -18,8 +18,8 @@ use crate::{
     models::{
         NetworkOptions, SETUP_COMMAND,
         manifest::{
-            Faults, FeaturesManifest, GeometryManifest, ImageTextManifest, MANIFEST, MasksManifest, is_plain,
-            unavailable,
+            Faults, FeaturesManifest, GeometryManifest, ImageTextManifest, MANIFEST, MasksManifest,
+            is_plain, unavailable,
         },
         onnx::OnnxHeader,
         places,

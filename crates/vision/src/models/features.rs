@@ -154,8 +154,7 @@ pub(super) fn signatures(manifest: &FeaturesManifest) -> Vec<Signature<'_>> {
 fn signature(manifest: &FeaturesManifest) -> Vec<Wanted<'_>> {
     let FeaturesManifest { input, keypoints, scores, descriptors, .. } = manifest;
     let cell = manifest.cell as usize;
-    let sides: Vec<usize> =
-        (1..=manifest.side as usize / cell).map(|cells| cells * cell).collect();
+    let sides: Vec<usize> = (1..=manifest.side as usize / cell).map(|cells| cells * cell).collect();
     let pictures = vec![vec![1], vec![3], sides.clone(), sides];
     let side = manifest.side as usize;
     vec![

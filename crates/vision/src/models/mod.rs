@@ -33,8 +33,8 @@ pub use frame::ModelFrame;
 pub use geometry::{Geometry, GeometryInput};
 pub use image_text::{ImageText, PreparedCrops};
 pub use manifest::{
-    DenseManifest, FeaturesManifest, GeometryManifest, ImageTextManifest, ImageTowerManifest, MaskAdapter,
-    MaskDecoderManifest, MaskEncoderManifest, MasksManifest, OutputFrame, PlainFile,
+    DenseManifest, FeaturesManifest, GeometryManifest, ImageTextManifest, ImageTowerManifest,
+    MaskAdapter, MaskDecoderManifest, MaskEncoderManifest, MasksManifest, OutputFrame, PlainFile,
     TextTowerManifest, Translation,
 };
 pub use masks::{MaskNetwork, PhotoEmbedding};

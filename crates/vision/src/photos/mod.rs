@@ -18,11 +18,11 @@ use std::{collections::BTreeMap, ops::Range, path::Path, sync::atomic::AtomicBoo
 use image::metadata::Orientation;
 use rayon::prelude::*;
 
+pub use self::unposed::{ReadUnposed, posed};
 use self::{
     decode::Header,
     turns::{SIDE_COMPARED, Way},
 };
-pub use self::unposed::{ReadUnposed, posed};
 pub use crate::scene::{Upload, UploadCameras, UploadFile};
 use crate::{
     error::{Result, short},
@@ -144,9 +144,7 @@ pub fn solved<'s>(
     report: &'s CamerasReport,
 ) -> impl Iterator<Item = (&'s str, SolvedCamera)> {
     let k1 = |file: &str| report.placed.iter().find(|one| one.file == file).map_or(0.0, |p| p.k1);
-    cameras.iter().map(move |of| {
-        (&*of.file, SolvedCamera { camera: of.camera, k1: k1(&of.file) })
-    })
+    cameras.iter().map(move |of| (&*of.file, SolvedCamera { camera: of.camera, k1: k1(&of.file) }))
 }
 
 /// A photo whose header is read, and whose pixels are not.

@@ -171,9 +171,9 @@ fn solved(pipeline: &Pipeline, photos: &[UnposedPhoto], watch: Watch<'_>) -> Res
         let scores = found.iter().map(|pair| pair.similarity.clamp(0.0, 1.0)).collect();
         Ok::<_, Error>(PairMatches { photos: [i, j], pairs, scores })
     };
-    let matches = pipeline.workers.install(|| {
-        pairs.par_iter().map(matched).collect::<Result<Vec<PairMatches>>>()
-    })?;
+    let matches = pipeline
+        .workers
+        .install(|| pairs.par_iter().map(matched).collect::<Result<Vec<PairMatches>>>())?;
     drop(descriptors);
     tell(MATCHES_END);
     let options = SolveOptions {

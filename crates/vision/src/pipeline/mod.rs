@@ -27,10 +27,12 @@ use crate::{
     meter,
     models::{Bundle, Geometry, GeometryInput, Network, NetworkOptions, Provider, Runtime},
     photos::{self, ReadPhotos, ReadUnposed},
+    refine::split,
     scene::{
-        Backdrop, Camera, CamerasMode, CamerasReport, Capture, Density, Gaussians, HealthReport, Intrinsics, Method, Photo,
-        PosedPhoto, Provenance, Scene, SceneCamera, SceneId, SceneMeta, SceneOptions, Stage,
-        StageTime, Upload, ViewSet, Warning, Watch, unless_cancelled,
+        Backdrop, Camera, CamerasMode, CamerasReport, Capture, Density, Gaussians, HealthReport,
+        Intrinsics, Method, Photo, PosedPhoto, Provenance, Scene, SceneCamera, SceneId, SceneMeta,
+        SceneOptions, Stage, StageTime, Upload, ViewGaussians, ViewSet, Warning, Watch,
+        unless_cancelled,
     },
 };
 
@@ -264,27 +266,86 @@ pub fn make(
     options: &SceneOptions,
     watch: Watch<'_>,
 ) -> Result<Reconstruction> {
-    let mut reconstruction =
-        reconstruct(pipeline, &photos.photos, options, watch.progress, watch.cancel)?;
-    reconstruction.report.stages.splice(0..0, photos.stages.iter().cloned());
-    reconstruction.report.cameras = photos.cameras.clone();
-    reconstruction.report.warnings.splice(0..0, photos.warnings.iter().cloned());
-    Ok(reconstruction)
+    let made = reconstruct(pipeline, &photos.photos, options, watch.progress, watch.cancel)?;
+    Ok(with_reading(made, photos))
 }
 
-/// As [`reconstruct`], and the same Gaussians as one set that agrees (`front_photos` = 0), with
-/// which refinement begins: of one run of the network.
+/// A reconstruction whose report has the stages before it, and where the cameras come from.
+fn with_reading(mut made: Reconstruction, photos: &PhotoSet) -> Reconstruction {
+    made.report.stages.splice(0..0, photos.stages.iter().cloned());
+    made.report.cameras = photos.cameras.clone();
+    made.report.warnings.splice(0..0, photos.warnings.iter().cloned());
+    made
+}
+
+/// What the network said of photos: Gaussians are united of it again, without some of the photos
+/// or as one set, and it need not run for that.
+#[derive(Clone, Debug)]
+pub struct Seen {
+    views: Vec<ViewGaussians>,
+    capture: Capture,
+    sets: Vec<ViewSet>,
+    method: Method,
+    stages: Vec<StageTime>,
+}
+
+impl Seen {
+    /// Bytes of its Gaussians.
+    #[must_use]
+    pub fn size_bytes(&self) -> u64 {
+        let of = |view: &ViewGaussians| {
+            let valid = view.valid.as_ref().map_or(0, Vec::len);
+            // Mean, scales, quaternion, opacity and confidence.
+            view.len() * 4 * (3 + 3 + 4 + 1 + 1) + 12 * view.sh.len() + valid
+        };
+        self.views.iter().map(|view| of(view) as u64).sum()
+    }
+}
+
+/// As [`make`], and what the network said of the photos.
 ///
 /// # Errors
 /// As [`reconstruct`].
-pub fn reconstruct_for_refinement(
+pub fn make_keeping(
     pipeline: &Pipeline,
-    photos: &[PosedPhoto],
+    photos: &PhotoSet,
     options: &SceneOptions,
     watch: Watch<'_>,
+) -> Result<(Reconstruction, Seen)> {
+    let seen = see(pipeline, &photos.photos, options, watch)?;
+    let made = united(pipeline, &photos.photos, seen.clone(), watch)?;
+    Ok((with_reading(made, photos), seen))
+}
+
+/// The scene of `photos` less those of the numbers `held`, and the same as one set that agrees
+/// (`front_photos` = 0), with which refinement begins; `seen` is what the network said of them all.
+///
+/// # Errors
+/// As [`reconstruct`].
+pub fn make_for_refinement(
+    pipeline: &Pipeline,
+    photos: &[PosedPhoto],
+    held: &[usize],
+    seen: &Seen,
+    watch: Watch<'_>,
 ) -> Result<(Reconstruction, Gaussians)> {
-    let (made, one_set) = run(pipeline, photos, options, watch, true)?;
-    let one_set = one_set.unwrap_or_else(|| made.gaussians.clone());
+    let (kept, _) = split(photos, held);
+    let mut seen = seen.clone();
+    seen.views.retain(|view| !held.contains(&usize::from(view.photo)));
+    for view in &mut seen.views {
+        let before = held.iter().filter(|&&i| i < usize::from(view.photo)).count();
+        view.photo -= u16::try_from(before).unwrap_or_default();
+    }
+    let layered = matches!(fusing(&seen.method), Fusion::Layers(_));
+    let views = if layered { seen.views.clone() } else { Vec::new() };
+    let made = united(pipeline, &kept, seen, watch)?;
+    let one_set = match layered {
+        true => {
+            let fusion = Fusion::OneSet(UnionOptions::default());
+            lifted(pipeline, &kept, views, &made.report.method, &fusion, watch)?.gaussians
+        }
+        false => made.gaussians.clone(),
+    };
     Ok((made, one_set))
 }
 
@@ -300,20 +361,19 @@ pub fn reconstruct(
     progress: &(dyn Fn(Stage, f32) + Sync),
     cancel: &AtomicBool,
 ) -> Result<Reconstruction> {
-    run(pipeline, photos, options, Watch { progress, cancel }, false).map(|(made, _)| made)
+    let watch = Watch { progress, cancel };
+    united(pipeline, photos, see(pipeline, photos, options, watch)?, watch)
 }
 
-/// The stages; with `as_one_set` the Gaussians once more as one set, where they are not one yet.
-fn run(
+/// The stages from photos to what the network says of them.
+fn see(
     pipeline: &Pipeline,
     photos: &[PosedPhoto],
     options: &SceneOptions,
     watch: Watch<'_>,
-    as_one_set: bool,
-) -> Result<(Reconstruction, Option<Gaussians>)> {
+) -> Result<Seen> {
     let Watch { progress, cancel } = watch;
     let mut stages = Stages::new(watch);
-    let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
     let manifest = pipeline.geometry.manifest();
     let views_max = views_max(options, manifest.views_min, manifest.views_max)?;
     let method = options.method();
@@ -325,7 +385,6 @@ fn run(
             manifest.views_min
         )));
     }
-
     let (capture, sets) = stages.run(Stage::Capture, || {
         pipeline.workers.install(|| {
             let capture = capture::analyse(photos, cancel)?;
@@ -350,28 +409,28 @@ fn run(
         }
         Ok(views)
     })?;
-    let (lifted, backdrop, one_set) = stages.run(Stage::Lift, || {
-        pipeline.workers.install(|| {
-            let thinning = match method.density {
-                Density::Thinned => Some(lift::ThinOptions::default()),
-                Density::Full => None,
-            };
-            let lift = |views, fusing: &Fusion| {
-                lift::lift(views, &cameras, method.prune, fusing, thinning.as_ref(), cancel)
-            };
-            let fusion = fusing(&method);
-            let layered = as_one_set && matches!(fusion, Fusion::Layers(_));
-            let again = layered.then(|| views.clone());
-            let backdrop = || match method.backdrop {
-                true => lift::backdrop(photos),
-                false => Backdrop::default(),
-            };
-            let (lifted, backdrop) = rayon::join(|| lift(views, &fusion), backdrop);
-            let one_set = again.map(|views| lift(views, &Fusion::OneSet(UnionOptions::default())));
-            Ok((lifted?, backdrop, one_set.transpose()?.map(|lifted| lifted.gaussians)))
-        })
-    })?;
+    Ok(Seen { views, capture, sets, method, stages: stages.times })
+}
 
+/// One scene of what the network said of its photos.
+fn united(
+    pipeline: &Pipeline,
+    photos: &[PosedPhoto],
+    seen: Seen,
+    watch: Watch<'_>,
+) -> Result<Reconstruction> {
+    let Seen { views, capture, sets, method, stages: before } = seen;
+    let mut stages = Stages { watch, times: before };
+    let (lifted, backdrop) = stages.run(Stage::Lift, || {
+        let fusion = fusing(&method);
+        let backdrop = || match method.backdrop {
+            true => lift::backdrop(photos),
+            false => Backdrop::default(),
+        };
+        let lift = || lifted(pipeline, photos, views, &method, &fusion, watch);
+        let (lifted, backdrop) = pipeline.workers.install(|| rayon::join(lift, backdrop));
+        Ok((lifted?, backdrop))
+    })?;
     let cameras = photos
         .iter()
         .zip(&lifted.lenses)
@@ -400,7 +459,26 @@ fn run(
         refinement: None,
         warnings: capture.warnings,
     };
-    Ok((Reconstruction { gaussians: lifted.gaussians, backdrop, report, cameras }, one_set))
+    Ok(Reconstruction { gaussians: lifted.gaussians, backdrop, report, cameras })
+}
+
+/// The Gaussians of what the network said of photos.
+fn lifted(
+    pipeline: &Pipeline,
+    photos: &[PosedPhoto],
+    views: Vec<ViewGaussians>,
+    method: &Method,
+    fusion: &Fusion,
+    watch: Watch<'_>,
+) -> Result<lift::Lifted> {
+    let thinning = match method.density {
+        Density::Thinned => Some(lift::ThinOptions::default()),
+        Density::Full => None,
+    };
+    let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
+    pipeline.workers.install(|| {
+        lift::lift(views, &cameras, method.prune, fusion, thinning.as_ref(), watch.cancel)
+    })
 }
 
 /// The stages of one job. Each is reported and timed. None begins after the job is cancelled.

@@ -1,7 +1,7 @@
-//! A whole refinement: first without the photos that are held out, which says whether it helps and
-//! with how many steps, then with all. And what it needs of the other stages: photos at the size at
-//! which they are learnt, the scene of the photos that are not held out, and semantics that follow
-//! other Gaussians.
+//! A whole refinement: first without the photos that are held out, which says whether it helps, then
+//! with all, and again with more steps as long as these help. And what it needs of the other stages:
+//! photos at the size at which they are learnt, the scene of the photos that are not held out, and
+//! semantics that follow other Gaussians.
 
 use std::{
     sync::mpsc::{RecvTimeoutError, channel},
@@ -9,6 +9,7 @@ use std::{
     time::Duration,
 };
 
+use rayon::prelude::*;
 use segsplat_render::{DifferentiableRenderer, Kinds, RenderRequest, plan::default_near};
 
 use super::Reconstruction;
@@ -16,8 +17,8 @@ use crate::{
     error::Result,
     models::{ResizeFilter, fit},
     refine::{
-        self, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, fewer, held_out,
-        mean_difference, ready, split,
+        self, Judged, RefineBudget, RefineOptions, RefinedVersion, Stepped, UNWATCHED_STEPS_MAX,
+        fewer, held_out, judged_as_served, mean_difference, ready, split,
     },
     scene::{
         Camera, Gaussians, HealthReport, Method, Photo, PosedPhoto, RefineReport, Scene,
@@ -31,131 +32,326 @@ use crate::{
 const AWAKE_EVERY: Duration = Duration::from_millis(4);
 const AWAKE_SIDE: u32 = 64;
 
-/// Longer side at which photos are learnt on a processor, pixels.
+/// Longer side at which photos are learnt on a processor, and of smaller copies there, pixels.
 const PROCESSOR_SIDE: u32 = 640;
+const PROCESSOR_COARSE_SIDE: u32 = 240;
 /// About what a Gaussian of degree 0 takes on a device, with moments, gradients and tile pairs.
 const DEVICE_BYTES_A_GAUSSIAN: u64 = 600;
+
+/// The work on a version makes all that was done this many times as long.
+const LONGER: u32 = 4;
 
 /// What a refinement came to.
 #[derive(Clone, Debug)]
 pub struct Refined {
     /// Its figures.
     pub report: RefineReport,
-    /// How much the proof's Gaussians differ from the held-out photos, as a multiple of how much
-    /// they differ from the learnt ones beside them; `None` where there was no proof, or nothing
-    /// better.
+    /// How much the first proof's Gaussians differ from the held-out photos, as a multiple of how
+    /// much they differ from the learnt ones beside them; `None` where there was no proof, or
+    /// nothing better.
     pub overfit: Option<f64>,
-    /// What it began with and the better version; `None` where none was better.
-    pub version: Option<(Scene, RefinedVersion)>,
+    /// Versions that were published.
+    pub versions: u32,
 }
 
-/// What the networks make of photos: [`super::reconstruct_for_refinement`].
-pub type Remake<'a> = &'a mut dyn FnMut(Vec<PosedPhoto>) -> Result<(Reconstruction, Gaussians)>;
+/// What a refinement asks of its caller. An error ends it.
+#[expect(missing_debug_implementations, reason = "functions have none")]
+pub struct RefineCalls<'a> {
+    /// The scene without the photos of these numbers, and the same as one set:
+    /// [`super::make_for_refinement`]. The last call is that of all photos.
+    pub remake: &'a mut dyn FnMut(&[usize]) -> Result<(Reconstruction, Gaussians)>,
+    /// Gets the share of the budget that is spent, 0..1, before each step, and may wait.
+    pub pace: &'a mut dyn FnMut(f32) -> Result<()>,
+    /// Gets each version that is better than the one before, with the scene that it began with.
+    pub publish: &'a mut dyn FnMut(&Scene, &RefinedVersion) -> Result<()>,
+}
 
 /// Refines `scene`, which was made of `photos`, within the budget of `options`.
 ///
-/// First the proof: a scene without the held-out photos is refined in a share of the time
-/// ([`RefineOptions::proof_share`]). Where its PSNR on these photos rises over that of what was
-/// served, a scene of all photos is refined with as many steps for each second that is left. It
-/// goes on from the proof's Gaussians, and those of the held-out photos, where the proof explains
-/// these nearly as well as photos that it learnt ([`RefineOptions::overfit_max`]); else it begins
-/// with those of the networks (docs/adr/0041). Of too few photos none is held out, and few steps
-/// are taken.
+/// The work is done in parts. The first has few steps, so that a better version is there soon, and
+/// each further one makes the work four times as long. A part begins with the proof: a scene
+/// without the held-out photos is refined in a share of the time
+/// ([`RefineOptions::proof_share`]). Where its PSNR on these photos rises over that of what is
+/// served, the scene of all photos is refined in the time of the part that is left, and published.
+/// Where the proof of a further part gains less than [`RefineOptions::gain_min`] in PSNR and SSIM
+/// together ([`Judged::score`]), the work ends: so more time is never worse.
+///
+/// The first scene of all photos goes on from the proof's Gaussians, and those of the held-out
+/// photos, where the proof explains these nearly as well as photos that it learnt
+/// ([`RefineOptions::overfit_max`]); else it begins with those of the networks (docs/adr/0041). Of
+/// too few photos none is held out, and few steps are taken.
 ///
 /// # Errors
-/// Those of `remake`, of `pace` and of [`refine::refine`].
+/// Those of `calls` and of [`refine::refine`].
 pub fn refined(
     renderer: &dyn DifferentiableRenderer,
     scene: &Scene,
     photos: &[PosedPhoto],
     options: &RefineOptions,
-    remake: Remake<'_>,
-    pace: &mut dyn FnMut(f32) -> Result<()>,
+    calls: RefineCalls<'_>,
 ) -> Result<Refined> {
     let held = held_out(photos.len());
-    let options = &fitted(options, photos, renderer.is_device());
-    let sized: Vec<PosedPhoto> = photos.iter().map(|photo| at_side(photo, options.side)).collect();
-    // The proof leaves room for the Gaussians of the photos that it lacks.
-    let share_of = |all: usize, held: &[usize]| {
-        all.saturating_mul(photos.len() - held.len()) / photos.len().max(1)
-    };
-    // The scene without the photos `held`, and what its refinement begins with.
-    let mut begin = |held: &[usize]| -> Result<(Scene, Gaussians)> {
-        let (learnt, one_set) = awake(renderer, scene, || remake(split(photos, held).0))?;
+    let options = fitted(options, photos, renderer.is_device());
+    let sized = photos.par_iter().map(|photo| at_side(photo, options.side)).collect();
+    let done = Work::default();
+    let mut parts = Parts { renderer, scene, photos: sized, options, calls, done };
+    if held.is_empty() { parts.unwatched() } else { parts.watched(&held) }
+}
+
+/// Steps that were taken, and their time.
+#[derive(Clone, Copy, Debug, Default)]
+struct Work {
+    steps: u32,
+    time: Duration,
+}
+
+/// A refinement at work.
+struct Parts<'a, 'c> {
+    renderer: &'a dyn DifferentiableRenderer,
+    scene: &'a Scene,
+    /// At the size at which they are learnt.
+    photos: Vec<PosedPhoto>,
+    options: RefineOptions,
+    calls: RefineCalls<'c>,
+    /// All that was done so far.
+    done: Work,
+}
+
+impl Parts<'_, '_> {
+    /// Few photos, of which none is held out.
+    fn unwatched(&mut self) -> Result<Refined> {
+        let (start, gaussians) = self.begin(&[])?;
+        let steps = self.options.budget.steps.min(UNWATCHED_STEPS_MAX);
+        let budget = RefineBudget { steps, ..self.options.budget };
+        let options = RefineOptions { budget, ..self.options };
+        let made = self.work(&start, &gaussians, &[], &options)?;
+        let report = self.report_of(&made, made.steps, [None; 2]);
+        let version = RefinedVersion { gaussians: made.gaussians, report: report.clone() };
+        (self.calls.publish)(&start, &version)?;
+        Ok(Refined { report, overfit: None, versions: 1 })
+    }
+
+    /// Photos of which those of the numbers `held` say how good versions are.
+    fn watched(&mut self, held: &[usize]) -> Result<Refined> {
+        let (proof_start, mut proof) = self.begin(held)?;
+        let held_photos = split(&self.photos, held).1;
+        let before = judged_as_served(self.renderer, &proof_start, &held_photos)?;
+        let before = before.map(|before| before.psnr);
+        let earlier = self.scene.meta.report.refinement.as_ref().and_then(|it| it.psnr_after);
+        let least = if earlier > before { earlier } else { before };
+        let mut last: Option<Judged> = None;
+        let mut found = Refined { report: self.as_before(before), overfit: None, versions: 0 };
+        // Of all photos: what it began with, how it is now, and how many steps it had.
+        let mut whole: Option<(Scene, Gaussians, u32)> = None;
+        while let Some(part) = self.next_part(whole.is_some()) {
+            let is_first = self.done.steps == 0;
+            let options = self.options_of(part, is_first);
+            let proof_options = RefineOptions {
+                budget: of_budget(part, self.proof_share()),
+                gaussians_max: self.share_without(held, options.gaussians_max),
+                ..options
+            };
+            let proven = self.work(&proof_start, &proof, held, &proof_options)?;
+            proof = proven.gaussians;
+            tracing::debug!(steps = proven.steps, judged = ?proven.judged, "proven");
+            let psnr = proven.judged.map(|judged| judged.psnr);
+            let gains = match (last, proven.judged) {
+                (Some(last), Some(now)) => now.score() > last.score() + self.options.gain_min,
+                _ => psnr > least,
+            };
+            if !gains {
+                // Too few steps may not have been enough; more that gain nothing are too many.
+                if whole.is_some() { break } else { continue }
+            }
+            last = proven.judged;
+            let (start, gaussians, steps) = match whole.take() {
+                Some(whole) => whole,
+                None => {
+                    let (overfit, start, gaussians) =
+                        self.begin_whole(held, &proof_start, &proof)?;
+                    found.overfit = Some(overfit);
+                    (start, gaussians, 0)
+                }
+            };
+            let budget = self.rest_of(part, proven.time);
+            let options = RefineOptions { budget, ..options };
+            let made = self.work(&start, &gaussians, &[], &options)?;
+            let steps = steps + made.steps;
+            found.report = self.report_of(&made, steps, [before, psnr]);
+            found.versions += 1;
+            let (gaussians, report) = (made.gaussians, found.report.clone());
+            let version = RefinedVersion { gaussians, report };
+            (self.calls.publish)(&start, &version)?;
+            whole = Some((start, version.gaussians, steps));
+        }
+        Ok(found)
+    }
+
+    /// The budget of the part that comes next; `None` where all is spent.
+    fn next_part(&self, is_published: bool) -> Option<RefineBudget> {
+        let left = self.left();
+        if left.steps == 0 || left.time.is_zero() {
+            return None;
+        }
+        if self.done.steps == 0 {
+            return Some(RefineBudget { steps: left.steps.min(self.options.first_steps), ..left });
+        }
+        // Where nothing was published yet, only proofs were made.
+        let proofs = if is_published { 1.0 } else { 1.0 / self.proof_share() };
+        let longer = (LONGER - 1) as f32 * proofs;
+        // What would be left after it must be worth a part of its own.
+        Some(if self.is_timed() {
+            let time = self.done.time.mul_f32(longer);
+            RefineBudget { time: if left.time < time * 2 { left.time } else { time }, ..left }
+        } else {
+            let steps = share_of(self.done.steps, longer);
+            RefineBudget { steps: if left.steps / 2 < steps { left.steps } else { steps }, ..left }
+        })
+    }
+
+    /// What a part has left after its proof, which took so long; all that is left at all where not
+    /// much more would come after it.
+    fn rest_of(&self, part: RefineBudget, proof: Duration) -> RefineBudget {
+        let (left, share) = (self.left(), 1.0 - self.proof_share());
+        let rest = of_budget(part, share);
+        let is_last = if self.is_timed() {
+            left.time < proof.mul_f32(2.0 * share / self.proof_share())
+        } else {
+            left.steps / 2 < rest.steps
+        };
+        if is_last { left } else { rest }
+    }
+
+    /// Whether time is what ends it.
+    fn is_timed(&self) -> bool {
+        self.options.budget.time < Duration::MAX
+    }
+
+    fn proof_share(&self) -> f32 {
+        self.options.proof_share.clamp(0.01, 0.99)
+    }
+
+    /// What is not spent of the budget.
+    fn left(&self) -> RefineBudget {
+        let (done, RefineBudget { steps, time }) = (self.done, self.options.budget);
+        let steps = steps.saturating_sub(done.steps);
+        RefineBudget { steps, time: time.saturating_sub(done.time) }
+    }
+
+    /// The options of a part: photos are learnt at half their size in the first alone.
+    fn options_of(&self, budget: RefineBudget, is_first: bool) -> RefineOptions {
+        let options = RefineOptions { budget, ..self.options };
+        match is_first {
+            true => options,
+            false => RefineOptions { coarse_share: 0.0, ..options },
+        }
+    }
+
+    /// Takes steps on all photos but those of the numbers `held`.
+    fn work(
+        &mut self,
+        start: &Scene,
+        gaussians: &Gaussians,
+        held: &[usize],
+        options: &RefineOptions,
+    ) -> Result<Stepped> {
+        let (learnt, held_out) = split(&self.photos, held);
+        let (done, budget, plan) = (self.done, self.options.budget, options.budget);
+        let share = |steps: u32, time: Duration| {
+            let steps = f64::from(steps) / f64::from(budget.steps.max(1));
+            steps.max(time.as_secs_f64() / budget.time.as_secs_f64().max(1e-3))
+        };
+        let begin = share(done.steps, done.time);
+        let end = share(
+            done.steps.saturating_add(plan.steps).min(budget.steps),
+            done.time.saturating_add(plan.time).min(budget.time),
+        );
+        #[expect(clippy::cast_possible_truncation, reason = "a share")]
+        let at = |spent: f32| (begin + (end - begin) * f64::from(spent)).min(1.0) as f32;
+        let mut pace = |spent: f32| (self.calls.pace)(at(spent));
+        let renderer = self.renderer;
+        let made =
+            refine::refine(renderer, start, gaussians, &learnt, &held_out, options, &mut pace)?;
+        self.done.steps += made.steps;
+        self.done.time += made.time;
+        Ok(made)
+    }
+
+    /// The scene without the photos `held`, and what its refinement begins with.
+    fn begin(&mut self, held: &[usize]) -> Result<(Scene, Gaussians)> {
+        let (renderer, scene) = (self.renderer, self.scene);
+        let (learnt, one_set) = awake(renderer, scene, || (self.calls.remake)(held))?;
         let (start, first) = start_of(scene, held, learnt, one_set)?;
-        let gaussians_first = share_of(options.gaussians_first.min(options.gaussians_max), held);
-        let gaussians = ready(&start, &first, &RefineOptions { gaussians_first, ..*options })?;
+        // The proof leaves room for the Gaussians of the photos that it lacks.
+        let most = self.options.gaussians_first.min(self.options.gaussians_max);
+        let gaussians_first = self.share_without(held, most);
+        let options = RefineOptions { gaussians_first, ..self.options };
+        let gaussians = ready(&start, &first, &options)?;
         Ok((start, gaussians))
-    };
-    let mut part = |start: (&Scene, &Gaussians),
-                    held: &[usize],
-                    options: &RefineOptions,
-                    [begin, end]: [f32; 2]| {
-        let (learnt, held_out) = split(&sized, held);
-        let mut pace = |spent: f32| pace(begin + (end - begin) * spent);
-        refine::refine(renderer, start.0, start.1, &learnt, &held_out, options, &mut pace)
-    };
-    let RefineBudget { steps, time } = options.budget;
-    if held.is_empty() {
-        let (start, gaussians) = begin(&[])?;
-        let budget = RefineBudget { steps: steps.min(UNWATCHED_STEPS_MAX), time };
-        let options = RefineOptions { budget, ..*options };
-        let version = part((&start, &gaussians), &[], &options, [0.0, 1.0])?;
-        let report = version.report.clone();
-        return Ok(Refined { report, overfit: None, version: Some((start, version)) });
     }
-    let share = options.proof_share.clamp(0.01, 0.99);
-    let budget = RefineBudget { steps, time: of_time(time, share) };
-    let (start, gaussians) = begin(&held)?;
-    let gaussians_max = share_of(options.gaussians_max, &held);
-    let proof_options = RefineOptions { budget, gaussians_max, ..*options };
-    let proof = part((&start, &gaussians), &held, &proof_options, [0.0, share])?;
-    let earlier = scene.meta.report.refinement.as_ref().and_then(|report| report.psnr_after);
-    if proof.report.steps == 0 || proof.report.psnr_after <= earlier {
-        return Ok(Refined { report: proof.report, overfit: None, version: None });
-    }
-    let differs = |at: &dyn Fn(usize) -> usize| {
-        let photos: Vec<PosedPhoto> = held.iter().map(|&i| sized[at(i)].clone()).collect();
-        mean_difference(renderer, &start, &proof.gaussians, &photos)
-    };
-    // The photo before each is learnt.
-    let overfit = differs(&|i| i)? / differs(&|i| i - 1)?;
-    let more = ((1.0 - share) / share).max(1.0);
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few steps")]
-    let as_many = (proof.report.steps as f32 * more).round() as u32;
-    // All the time that is left, unless the proof became worse again.
-    let is_timed = time < Duration::MAX && !proof.is_peak;
-    let mut options = RefineOptions {
-        budget: RefineBudget {
-            steps: if is_timed { steps } else { as_many.min(steps) },
-            time: of_time(time, 1.0 - share),
-        },
-        ..*options
-    };
-    let (start, mut gaussians) = begin(&[])?;
-    if overfit <= f64::from(options.overfit_max) {
+
+    /// The scene of all photos, what its refinement begins with, and how much the proof overfits.
+    fn begin_whole(
+        &mut self,
+        held: &[usize],
+        proof_start: &Scene,
+        proof: &Gaussians,
+    ) -> Result<(f64, Scene, Gaussians)> {
+        let (start, gaussians) = self.begin(&[])?;
+        let differs = |at: &dyn Fn(usize) -> usize| {
+            let photos: Vec<PosedPhoto> =
+                held.iter().map(|&i| self.photos[at(i)].clone()).collect();
+            mean_difference(self.renderer, proof_start, proof, &photos)
+        };
+        // The photo before each is learnt.
+        let overfit = differs(&|i| i)? / differs(&|i| i - 1)?;
+        if overfit > f64::from(self.options.overfit_max) {
+            return Ok((overfit, start, gaussians));
+        }
         let of_held = |i: usize| held.contains(&usize::from(gaussians.source()[i].view));
-        let room = options.gaussians_max.saturating_sub(proof.gaussians.len());
-        let more = fewer(&gaussians.only(of_held), room, options.seed)?;
-        gaussians = proof.gaussians.joined(&more)?;
-        options.coarse_share = 0.0;
+        let room = self.options.gaussians_max.saturating_sub(proof.len());
+        let more = fewer(&gaussians.only(of_held), room, self.options.seed)?;
+        Ok((overfit, start, proof.joined(&more)?))
     }
-    let mut version = part((&start, &gaussians), &[], &options, [share, 1.0])?;
-    version.report = RefineReport {
-        seconds: proof.report.seconds + version.report.seconds,
-        psnr_before: proof.report.psnr_before,
-        psnr_after: proof.report.psnr_after,
-        ..version.report
-    };
-    let report = version.report.clone();
-    Ok(Refined { report, overfit: Some(overfit), version: Some((start, version)) })
+
+    /// The share of `all` Gaussians that belongs to the photos but those of the numbers `held`.
+    fn share_without(&self, held: &[usize], all: usize) -> usize {
+        let photos = self.photos.len();
+        all.saturating_mul(photos - held.len()) / photos.max(1)
+    }
+
+    /// The figures where nothing is better than what is served.
+    fn as_before(&self, psnr: Option<f64>) -> RefineReport {
+        let gaussians = self.scene.gaussians.len() as u64;
+        RefineReport {
+            psnr_before: psnr,
+            psnr_after: psnr,
+            gaussians_before: gaussians,
+            gaussians_after: gaussians,
+            ..RefineReport::default()
+        }
+    }
+
+    /// The figures of a version that so many steps made of all photos.
+    fn report_of(&self, made: &Stepped, steps: u32, psnr: [Option<f64>; 2]) -> RefineReport {
+        let [psnr_before, psnr_after] = psnr;
+        RefineReport {
+            steps,
+            seconds: self.done.time.as_secs_f64(),
+            psnr_before,
+            psnr_after,
+            gaussians_after: made.gaussians.len() as u64,
+            ..self.as_before(None)
+        }
+    }
 }
 
 /// The options with a side and a number of Gaussians for which there is time and room: a half of a
 /// device's bytes is for the photos and their smaller copies, a half for the Gaussians.
 fn fitted(options: &RefineOptions, photos: &[PosedPhoto], is_device: bool) -> RefineOptions {
     if !is_device {
-        return RefineOptions { side: options.side.min(PROCESSOR_SIDE), ..*options };
+        let side = options.side.min(PROCESSOR_SIDE);
+        return RefineOptions { side, coarse_side_min: PROCESSOR_COARSE_SIDE, ..*options };
     }
     let half = options.device_bytes_max / 2;
     let pixels = |side: u32| -> f64 {
@@ -199,9 +395,18 @@ fn awake<T>(renderer: &dyn DifferentiableRenderer, scene: &Scene, work: impl FnO
     })
 }
 
-/// A share of a time that may be endless.
-fn of_time(time: Duration, share: f32) -> Duration {
-    Duration::try_from_secs_f64(time.as_secs_f64() * f64::from(share)).unwrap_or(Duration::MAX)
+/// A share of a budget that may be endless; a step at least.
+fn of_budget(budget: RefineBudget, share: f32) -> RefineBudget {
+    let time = Duration::try_from_secs_f64(budget.time.as_secs_f64() * f64::from(share));
+    let steps = share_of(budget.steps, share).max(1);
+    RefineBudget { steps, time: time.unwrap_or(Duration::MAX) }
+}
+
+/// So many times `count`, the most that there is where that is more.
+fn share_of(count: u32, times: f32) -> u32 {
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates")]
+    let times = (f64::from(count) * f64::from(times)).round() as u32;
+    times
 }
 
 /// A photo whose longer side is `side` pixels, or as it is if that is shorter.

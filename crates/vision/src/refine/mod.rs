@@ -7,13 +7,13 @@
 //! photos ([`segsplat_render::train::Trainer::grow`]). Large photos are learnt at half their size
 //! first.
 //!
-//! **Held out.** Of five photos and more, every eighth is held out ([`held_out`]): the steps never
-//! see it, and a version counts as better only where its PSNR on these photos is over that of the
-//! scene as it is served. They must not be in the Gaussians that come in either: make the scene of
-//! the others ([`split`]).
+//! **Held out.** Of five photos and more, some are held out ([`held_out`]): the steps never see
+//! them, and steps are of use only where PSNR on these photos is over that of the scene as it is
+//! served. They must not be in the Gaussians that come in either: make the scene of the others
+//! ([`split`]).
 //!
-//! That says whether it helps and how many steps are good. What is served then learns all photos,
-//! so that it lacks none ([`crate::pipeline::refinement::refined`]).
+//! That says whether steps help, and whether more of them do. What is served learns all photos, so
+//! that it lacks none ([`crate::pipeline::refinement::refined`]).
 //!
 //! **One set.** A scene that comes in may be served in layers and with magnification. What comes
 //! out is plain: the same Gaussians for every view and for other programs.
@@ -39,12 +39,13 @@ use crate::{
 
 /// Fewest photos of which one is held out.
 pub const HOLDS_OUT_FROM: usize = 5;
-/// Every so many photos one is held out.
-pub const HELD_OUT_EVERY: usize = 8;
+/// Every so many photos one is held out: fewer where that is one alone, which says little.
+const HELD_OUT_EVERY: [usize; 2] = [4, 8];
+/// Photos that are held out at least, where there are enough, and the photos that are enough.
+const HELD_OUT_MIN: usize = 3;
+const HELD_OUT_MORE_FROM: usize = 8;
 /// Most steps of a scene of few photos, where none is held out to tell when to stop.
 pub const UNWATCHED_STEPS_MAX: u32 = 30;
-/// Looks at the held-out photos in a whole budget.
-const LOOKS: u32 = 10;
 /// Shares of the budget between which Gaussians are added, steps between two times, what share of
 /// them comes each time, and photos that say where: docs/adr/0070.
 const GROWS_BETWEEN: [f32; 2] = [0.1, 0.7];
@@ -52,8 +53,6 @@ const GROWS_EVERY: u32 = 100;
 /// Expected steps under which none is added: they would not pay for it.
 const GROWS_FROM_STEPS: f32 = 300.0;
 const GROWTH_PHOTOS: usize = 4;
-/// Photos with a longer side under this have no smaller copies that come first.
-const COARSE_SIDE_MIN: u32 = 480;
 /// How far numbers move at first, `means` as a share of the median depth. 3DGS takes 30,000 steps
 /// that move less: docs/adr/0041.
 const RATES: LearningRates = LearningRates {
@@ -71,6 +70,8 @@ const LAST_RATE: f32 = 0.1;
 const STEPS_A_PHOTO: f32 = 200.0;
 const RATE_FACTOR_POWER: f32 = 0.4;
 const RATE_FACTOR_MAX: f32 = 2.0;
+/// What an SSIM of 1 is worth, dB of PSNR.
+const SSIM_DB: f64 = 20.0;
 /// How fast an exposure moves.
 const EXPOSURE_RATE: f32 = 5e-3;
 
@@ -116,15 +117,21 @@ pub struct RefineOptions {
     pub growth: f32,
     /// Share of the budget in which photos are learnt at half their size, 0..1.
     pub coarse_share: f32,
-    /// Looks at the held-out photos without a better version after which it stops.
-    pub patience: u32,
+    /// Longer side of such a smaller copy at least, pixels: under it a photo has none.
+    pub coarse_side_min: u32,
+    /// Factor on all rates.
+    pub rate: f32,
     /// Gaussians under this opacity are dropped.
     pub opacity_min: f32,
     /// Steps between two times of dropping.
     pub prune_every: u32,
     /// Share of SSIM in the loss, 0..1.
     pub ssim_share: f32,
-    /// Share of the time that goes to the scene without the held-out photos, 0..1
+    /// Steps until the first version ([`crate::pipeline::refinement::refined`]).
+    pub first_steps: u32,
+    /// What the work on a further version must gain on the held-out photos ([`Judged::score`]).
+    pub gain_min: f64,
+    /// Share of the work that goes to the scene without the held-out photos, 0..1
     /// ([`crate::pipeline::refinement::refined`]).
     pub proof_share: f32,
     /// Most that the proof's Gaussians may differ from the held-out photos, as a multiple of how
@@ -148,11 +155,14 @@ impl Default for RefineOptions {
             gaussians_a_pixel: 0.5,
             gaussians_max: 1_000_000,
             growth: 0.04,
-            coarse_share: 0.3,
-            patience: LOOKS,
+            coarse_share: 0.5,
+            coarse_side_min: 480,
+            rate: 1.0,
             opacity_min: 0.01,
             prune_every: 50,
             ssim_share: 0.2,
+            first_steps: 400,
+            gain_min: 0.1,
             proof_share: 0.25,
             overfit_max: 1.5,
             device_bytes_max: 2 << 30,
@@ -169,18 +179,52 @@ pub struct RefinedVersion {
     pub gaussians: Gaussians,
     /// How good it is; which photos are held out is for the caller to say.
     pub report: RefineReport,
-    /// Whether what came after it in the budget was worse.
-    pub is_peak: bool,
 }
 
-/// Numbers of the photos that are held out of `count`: the fourth and every eighth from there on,
-/// none of fewer than [`HOLDS_OUT_FROM`].
+/// What steps made.
+#[derive(Clone, Debug)]
+pub struct Stepped {
+    /// The Gaussians after them, as in [`RefinedVersion::gaussians`].
+    pub gaussians: Gaussians,
+    /// How many were taken.
+    pub steps: u32,
+    /// How long they took, without what [`refine`]'s `pace` waited.
+    pub time: Duration,
+    /// How they show the held-out photos; `None` without such photos.
+    pub judged: Option<Judged>,
+}
+
+/// How near views are to photos that are not in a scene.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Judged {
+    /// Mean PSNR, dB.
+    pub psnr: f64,
+    /// Mean SSIM.
+    pub ssim: f64,
+}
+
+impl Judged {
+    /// One number for both, dB: PSNR alone takes what is soft for as good as what is sharp.
+    #[must_use]
+    pub fn score(&self) -> f64 {
+        self.psnr + SSIM_DB * self.ssim
+    }
+}
+
+/// Numbers of the photos that are held out of `count`, evenly spread: every eighth, of less than 24
+/// more often so that there are three where that leaves most; none of fewer than
+/// [`HOLDS_OUT_FROM`].
 #[must_use]
 pub fn held_out(count: usize) -> Vec<usize> {
     if count < HOLDS_OUT_FROM {
         return Vec::new();
     }
-    (HELD_OUT_EVERY / 2 - 1..count).step_by(HELD_OUT_EVERY).collect()
+    let [often, seldom] = HELD_OUT_EVERY;
+    let every = match count < HELD_OUT_MORE_FROM {
+        true => seldom,
+        false => (count / HELD_OUT_MIN).clamp(often, seldom),
+    };
+    (every / 2 - 1..count).step_by(every).collect()
 }
 
 /// Photos to learn from, and those of the numbers `held`: what makes the scene that is refined must
@@ -276,20 +320,6 @@ impl Clock {
     }
 }
 
-/// A refinement at work.
-struct Refinement<'a> {
-    renderer: &'a dyn DifferentiableRenderer,
-    start: &'a Scene,
-    options: &'a RefineOptions,
-    learnt: &'a [PosedPhoto],
-    held_out: Vec<HeldOutPhoto>,
-    /// Whether the trainer has smaller copies of the photos behind them.
-    has_coarse: bool,
-    /// Gaussians that it begins with.
-    first: usize,
-    report: RefineReport,
-}
-
 /// The Gaussians that the steps begin with: `first`, the one set of Gaussians of `start`, with its
 /// magnification for good, and no more of them than `options` say.
 ///
@@ -300,14 +330,13 @@ pub fn ready(start: &Scene, first: &Gaussians, options: &RefineOptions) -> Resul
     fewer(&all, options.gaussians_first.min(options.gaussians_max), options.seed)
 }
 
-/// Refines `gaussians` on the photos that are learnt and watches the held-out ones. `start` is what
-/// is served of the learnt photos alone, and `gaussians` the same ([`ready`]). The photos are
-/// used at the size that they have. Before each step `pace` gets the share of the budget that is
-/// spent, 0..1; it may wait, which is not counted, and its error ends the work. Returns the best
-/// version: `start` itself where none was better.
+/// Refines `gaussians` on the photos that are learnt, over what is behind those of `start` (what
+/// they are, [`ready`] says), and looks at the held-out ones afterwards. The photos are used at the
+/// size that they have. Before each step `pace` gets the share of the budget that is spent, 0..1;
+/// it may wait, which is not counted, and its error ends the work.
 ///
-/// Without held-out photos the last version is the one. Of fewer than [`HOLDS_OUT_FROM`] at most
-/// [`UNWATCHED_STEPS_MAX`] steps are taken.
+/// Without held-out photos, of fewer than [`HOLDS_OUT_FROM`] at most [`UNWATCHED_STEPS_MAX`] steps
+/// are taken.
 ///
 /// # Errors
 /// `invalid_request` for options out of range; what the renderer or `pace` says.
@@ -319,28 +348,16 @@ pub fn refine(
     held_out: &[PosedPhoto],
     options: &RefineOptions,
     pace: &mut dyn FnMut(f32) -> Result<()>,
-) -> Result<RefinedVersion> {
+) -> Result<Stepped> {
     let over_0 = [options.gaussians_first, options.gaussians_max, options.batch];
     if options.prune_every == 0 || over_0.contains(&0) {
         return Err(Error::invalid("refine: batch, prune_every, gaussians_* must be over 0"));
     }
-    let extent = start.meta.report.median_depth;
-    let mut work = Refinement {
-        renderer,
-        start,
-        options,
-        learnt,
-        held_out: held_out.par_iter().map(HeldOutPhoto::new).collect(),
-        has_coarse: false,
-        first: gaussians.len(),
-        report: RefineReport::default(),
-    };
-    work.report = match &start.meta.report.refinement {
-        Some(earlier) => earlier.clone(),
-        None => work.as_served()?,
-    };
+    let held_out: Vec<HeldOutPhoto> = held_out.par_iter().map(HeldOutPhoto::new).collect();
     if learnt.is_empty() || gaussians.is_empty() {
-        return Ok(work.unrefined());
+        let view = |camera| renderer.render(gaussians, &plain_view(start, camera));
+        let (steps, time, judged) = (0, Duration::ZERO, judged(&held_out, view)?);
+        return Ok(Stepped { gaussians: gaussians.clone(), steps, time, judged });
     }
     // Behind the photos their smaller copies.
     let coarse = coarse_copies(learnt, options);
@@ -348,32 +365,88 @@ pub fn refine(
         photo: &posed.photo,
         request: plain_view(start, posed.camera),
     });
-    work.has_coarse = !coarse.is_empty();
     let (ssim_share, gaussians_max) = (options.ssim_share, most_gaussians(learnt, options));
     let set = TrainingSet { gaussians, photos: photos.collect(), ssim_share, gaussians_max };
-    #[expect(clippy::cast_possible_truncation, reason = "a length")]
-    let extent = if extent.is_finite() && extent > 0.0 { extent as f32 } else { 1.0 };
-    let rates = LearningRates { means: options.rates.means * extent, ..options.rates };
+    let is_few = held_out.is_empty() && learnt.len() < HOLDS_OUT_FROM;
+    let course = Course {
+        is_few,
+        photos: learnt.len(),
+        coarse_share: if coarse.is_empty() { 0.0 } else { options.coarse_share },
+        gaussians: gaussians.len(),
+        gaussians_max,
+        rates: rates_of(start, options),
+        options,
+        order: Vec::new(),
+        random: options.seed,
+        grows_at: 0,
+    };
+    let mut run = |trainer: &mut dyn Trainer| {
+        let (steps, time) = course.clone().run(trainer, pace)?;
+        let judged = judged(&held_out, |camera| trainer.render(&plain_view(start, camera)))?;
+        Ok(Stepped { gaussians: trainer.gaussians()?, steps, time, judged })
+    };
     // The device first. What it has no room for, or what is lost with it, is done over.
     let made = renderer
         .trainer(&set, options.device_bytes_max)
-        .and_then(|trainer| trainer.map(|mut it| work.run(&mut *it, &rates, pace)).transpose());
+        .and_then(|trainer| trainer.map(|mut it| run(&mut *it)).transpose());
     match made {
         Ok(None) => {}
-        Ok(Some(version)) => return Ok(version),
+        Ok(Some(made)) => return Ok(made),
         Err(error) if is_of_device(error.code()) => {
             tracing::warn!(reason = error.message(), "refined on the processor");
         }
         Err(error) => return Err(error),
     }
-    work.run(&mut HostTrainer::new(renderer, &set)?, &rates, pace)
+    run(&mut HostTrainer::new(renderer, &set)?)
+}
+
+/// How near a scene as it is served, in layers where it has some, is to photos that are not in it;
+/// `None` of no photo.
+///
+/// # Errors
+/// What the renderer says.
+pub fn judged_as_served(
+    renderer: &dyn DifferentiableRenderer,
+    scene: &Scene,
+    held_out: &[PosedPhoto],
+) -> Result<Option<Judged>> {
+    let held_out: Vec<HeldOutPhoto> = held_out.par_iter().map(HeldOutPhoto::new).collect();
+    let near = default_near(scene.meta.report.median_depth);
+    let view = |camera| served(scene, RenderRequest::plain(camera, Kinds::COLOR, near));
+    judged(&held_out, |camera| renderer.render(&scene.gaussians, &view(camera)))
+}
+
+/// How near what `draw` gives is to photos, colours as 8 bits hold them; `None` of no photo.
+fn judged(
+    photos: &[HeldOutPhoto],
+    mut draw: impl FnMut(Camera) -> Result<Frame>,
+) -> Result<Option<Judged>> {
+    let mut sum = Judged { psnr: 0.0, ssim: 0.0 };
+    for photo in photos {
+        let mut color = draw(photo.camera)?.color.unwrap_or_default();
+        color.iter_mut().flatten().for_each(|v| *v = v.clamp(0.0, 1.0));
+        let (width, valid) = (photo.camera.intrinsics.width as usize, photo.valid.as_deref());
+        sum.psnr += psnr(&color, &photo.rgb, valid);
+        sum.ssim += 1.0 - photo_loss(&color, &photo.rgb, width, valid, 1.0).value;
+    }
+    let count = photos.len() as f64;
+    Ok((count > 0.0).then(|| Judged { psnr: sum.psnr / count, ssim: sum.ssim / count }))
+}
+
+/// The rates at first, means in world units.
+fn rates_of(start: &Scene, options: &RefineOptions) -> LearningRates {
+    let extent = start.meta.report.median_depth;
+    #[expect(clippy::cast_possible_truncation, reason = "a length")]
+    let extent = if extent.is_finite() && extent > 0.0 { extent as f32 } else { 1.0 };
+    let rates = LearningRates { means: options.rates.means * extent, ..options.rates };
+    rates.scaled(options.rate)
 }
 
 /// The photos at half their size, where they are learnt so at first and are large enough.
 fn coarse_copies(photos: &[PosedPhoto], options: &RefineOptions) -> Vec<PosedPhoto> {
     let longer = |posed: &PosedPhoto| posed.photo.width.max(posed.photo.height);
     let least = photos.iter().map(longer).min().unwrap_or(0) / 2;
-    if options.coarse_share <= 0.0 || least < COARSE_SIDE_MIN {
+    if options.coarse_share <= 0.0 || least < options.coarse_side_min {
         return Vec::new();
     }
     photos.par_iter().map(halved).collect()
@@ -418,126 +491,101 @@ fn is_of_device(code: ErrorCode) -> bool {
     matches!(code, ErrorCode::GpuUnavailable | ErrorCode::LimitExceeded)
 }
 
-impl Refinement<'_> {
+/// What each step does.
+#[derive(Clone, Debug)]
+struct Course<'a> {
+    options: &'a RefineOptions,
+    /// Whether nothing tells when to stop.
+    is_few: bool,
+    /// Photos to learn; behind them the trainer has their smaller copies, where they are used.
+    photos: usize,
+    coarse_share: f32,
+    /// Gaussians now, and most of them.
+    gaussians: usize,
+    gaussians_max: usize,
+    /// At first.
+    rates: LearningRates,
+    /// Photos that come next, the last one first.
+    order: Vec<usize>,
+    random: u64,
+    /// Steps after which some are added again.
+    grows_at: u32,
+}
+
+impl Course<'_> {
+    /// Takes steps until the budget is spent. How many, and how long they took.
     fn run(
-        &self,
+        mut self,
         trainer: &mut dyn Trainer,
-        rates: &LearningRates,
         pace: &mut dyn FnMut(f32) -> Result<()>,
-    ) -> Result<RefinedVersion> {
-        let options = self.options;
-        let begun = Instant::now();
-        let mut clock = Clock { budget: options.budget, begun, waited: Duration::ZERO };
-        let watched = !self.held_out.is_empty();
-        let few = !watched && self.learnt.len() < HOLDS_OUT_FROM;
-        let mut best: Option<RefineReport> = None;
-        let mut is_peak;
-        let (mut order, mut random) = (Vec::<usize>::new(), options.seed);
-        let (mut steps, mut looked, mut waited, mut highest) = (0_u32, 0, 0, None);
-        let (mut grows_at, mut now, count) = (0, self.first, self.learnt.len());
-        let most = most_gaussians(self.learnt, options);
+    ) -> Result<(u32, Duration)> {
+        let (budget, begun) = (self.options.budget, Instant::now());
+        let mut clock = Clock { budget, begun, waited: Duration::ZERO };
+        let mut steps = 0;
         loop {
             let spent = clock.spent(steps);
             let paused = Instant::now();
             pace(spent)?;
             clock.waited += paused.elapsed();
-            let last = spent >= 1.0 || (few && steps >= UNWATCHED_STEPS_MAX);
-            if last || (watched && spent * LOOKS as f32 >= (looked + 1) as f32) {
-                looked += 1;
-                waited += 1;
-                let after =
-                    self.held_out_psnr(|camera| trainer.render(&plain_view(self.start, camera)))?;
-                if after > highest {
-                    (highest, waited) = (after, 0);
-                }
-                tracing::debug!(steps, psnr = after, "looked");
-                let reached = best.as_ref().unwrap_or(&self.report).psnr_after;
-                let better = match (after, reached) {
-                    (Some(after), Some(reached)) => after > reached,
-                    _ => last && steps > 0,
-                };
-                if better {
-                    trainer.keep()?;
-                    let seconds = self.report.seconds + clock.worked().as_secs_f64();
-                    let steps = self.report.steps + steps;
-                    let served = self.report.clone();
-                    best = Some(RefineReport { steps, seconds, psnr_after: after, ..served });
-                }
-                is_peak = !better;
-                if last || waited >= options.patience {
-                    break;
-                }
+            if spent >= 1.0 || (self.is_few && steps >= UNWATCHED_STEPS_MAX) {
+                return Ok((steps, clock.worked()));
             }
-            let coarse = self.has_coarse && spent < options.coarse_share;
-            let of_size = |i: usize| if coarse { count + i } else { i };
-            let [from, to] = GROWS_BETWEEN;
-            let grows = options.growth > 0.0 && (from..to).contains(&spent) && !few;
-            let pays = steps as f32 >= GROWS_FROM_STEPS * spent;
-            if grows && pays && steps >= grows_at {
-                grows_at = steps + GROWS_EVERY;
-                let photos = shuffled(count, &mut random).into_iter().map(of_size);
-                let photos: Vec<usize> = photos.take(GROWTH_PHOTOS).collect();
-                now = trainer
-                    .grow(&photos, most.min(now + (now as f32 * options.growth) as usize))?;
-                tracing::debug!(steps, gaussians = now, "grown");
+            if let Some((photos, until)) = self.growth(steps, spent) {
+                self.gaussians = trainer.grow(&photos, until)?;
+                tracing::debug!(steps, gaussians = self.gaussians, "grown");
             }
-            let expected = steps as f32 / spent / count as f32;
-            let rate = LAST_RATE.powf(spent) * if few { 1.0 } else { rate_factor(expected) };
-            let mut photos = Vec::with_capacity(options.batch);
-            while photos.len() < options.batch {
-                if order.is_empty() {
-                    order = shuffled(count, &mut random);
-                }
-                photos.extend(order.pop().map(of_size));
-            }
+            let step = self.step(steps, spent);
             steps += 1;
-            let prunes = steps.is_multiple_of(options.prune_every);
-            let step = TrainingStep {
-                rates: rates.scaled(rate),
-                exposure: EXPOSURE_RATE * rate,
-                opacity_min: if prunes { options.opacity_min } else { 0.0 },
-            };
-            trainer.step(&photos, &step)?;
-        }
-        let Some(report) = best else { return Ok(self.unrefined()) };
-        let gaussians = trainer.kept()?;
-        let report = RefineReport { gaussians_after: gaussians.len() as u64, ..report };
-        Ok(RefinedVersion { gaussians, report, is_peak })
-    }
-
-    /// The scene that came in.
-    fn unrefined(&self) -> RefinedVersion {
-        RefinedVersion {
-            gaussians: self.start.gaussians.clone(),
-            report: self.report.clone(),
-            is_peak: true,
+            trainer.step(&self.next_photos(spent), &step)?;
         }
     }
 
-    /// The report of the scene before any step: as it is served, in layers where it has some.
-    fn as_served(&self) -> Result<RefineReport> {
-        let (scene, count) = (self.start, self.start.gaussians.len() as u64);
-        let near = default_near(scene.meta.report.median_depth);
-        let view = |camera| served(scene, RenderRequest::plain(camera, Kinds::COLOR, near));
-        let psnr =
-            self.held_out_psnr(|camera| self.renderer.render(&scene.gaussians, &view(camera)))?;
-        let counts = RefineReport {
-            gaussians_before: count,
-            gaussians_after: count,
-            ..RefineReport::default()
+    /// Where Gaussians are to be added before the next step: photos that say where, and how many
+    /// there are to be then.
+    fn growth(&mut self, steps: u32, spent: f32) -> Option<(Vec<usize>, usize)> {
+        let [from, to] = GROWS_BETWEEN;
+        let growth = self.options.growth;
+        let grows = growth > 0.0 && (from..to).contains(&spent) && !self.is_few;
+        let pays = steps as f32 >= GROWS_FROM_STEPS * spent;
+        if !grows || !pays || steps < self.grows_at {
+            return None;
+        }
+        self.grows_at = steps + GROWS_EVERY;
+        let first = self.first_copy(spent);
+        let photos = shuffled(self.photos, &mut self.random).into_iter().take(GROWTH_PHOTOS);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share")]
+        let more = (self.gaussians as f32 * growth) as usize;
+        let until = self.gaussians_max.min(self.gaussians + more);
+        Some((photos.map(|i| first + i).collect(), until))
+    }
+
+    /// Photos of the next step: all of them by turns, each time in another order.
+    fn next_photos(&mut self, spent: f32) -> Vec<usize> {
+        let first = self.first_copy(spent);
+        let next = |_| {
+            if self.order.is_empty() {
+                self.order = shuffled(self.photos, &mut self.random);
+            }
+            first + self.order.pop().unwrap_or_default()
         };
-        Ok(RefineReport { psnr_before: psnr, psnr_after: psnr, ..counts })
+        (0..self.options.batch).map(next).collect()
     }
 
-    /// Mean PSNR of what `draw` gives on the held-out photos, colours as 8 bits hold them.
-    fn held_out_psnr(&self, mut draw: impl FnMut(Camera) -> Result<Frame>) -> Result<Option<f64>> {
-        let mut sum = 0.0;
-        for photo in &self.held_out {
-            let mut color = draw(photo.camera)?.color.unwrap_or_default();
-            color.iter_mut().flatten().for_each(|v| *v = v.clamp(0.0, 1.0));
-            sum += psnr(&color, &photo.rgb, photo.valid.as_deref());
+    /// Number of the first photo in the size that is learnt now.
+    fn first_copy(&self, spent: f32) -> usize {
+        if spent < self.coarse_share { self.photos } else { 0 }
+    }
+
+    /// How the step after so many moves what it moves.
+    fn step(&self, steps: u32, spent: f32) -> TrainingStep {
+        let expected = steps as f32 / spent / self.photos as f32;
+        let rate = LAST_RATE.powf(spent) * if self.is_few { 1.0 } else { rate_factor(expected) };
+        let prunes = (steps + 1).is_multiple_of(self.options.prune_every);
+        TrainingStep {
+            rates: self.rates.scaled(rate),
+            exposure: EXPOSURE_RATE * rate,
+            opacity_min: if prunes { self.options.opacity_min } else { 0.0 },
         }
-        Ok((!self.held_out.is_empty()).then(|| sum / self.held_out.len() as f64))
     }
 }
 
