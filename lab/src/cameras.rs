@@ -65,8 +65,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         *outcomes.entry(outcome).or_default() += 1;
         let Compared { placed, rotation_deg, focal } = compared;
         progress(&format!(
-            "{name}: {placed} of {} placed, {rotation_deg:.2} degrees, focal {focal:.3}, confidence \
-             {:.2}, {seconds:.1} s -> {outcome}",
+            "{name}: {placed} of {} placed, {rotation_deg:.2} degrees, focal {focal:.3}, \
+             confidence {:.2}, {seconds:.1} s -> {outcome}",
             photos.len(),
             found.confidence
         ));

@@ -82,8 +82,8 @@ AS_JPEG = (
 NOT_READ = frozenset({"points3D", "rigs", "frames", "project"})
 DEPTHS = frozenset({"depth", "confidence", "lowres_depth", "highres_depth"})
 
-#: A folder with photos, or a capture of any layout that the server knows; an archive of one; a file of
-#: Gaussians (PLY, SPZ, SOG, GLB, .splat); or photos and their cameras.
+#: A folder with photos, or a capture of any layout that the server knows; an archive of one; a
+#: file of Gaussians (PLY, SPZ, SOG, GLB, .splat); or photos and their cameras.
 Source: TypeAlias = str | Path | Mapping[str | Path, Camera]
 #: A scene as the server shows it.
 Shown: TypeAlias = tuple[SceneStatus, tuple[Photo, ...]]
