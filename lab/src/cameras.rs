@@ -7,7 +7,7 @@
 use std::{collections::HashMap, path::Path, sync::atomic::AtomicBool, time::Instant};
 
 use glam::DMat3;
-use segsplat_vision::pipeline::cameras::{Judged, judged};
+use segsplat_vision::pipeline::cameras::{JudgedCameras, judged};
 use serde_json::{Value, json};
 
 use crate::{
@@ -128,7 +128,7 @@ struct Compared {
 }
 
 impl Compared {
-    fn new(capture: &Capture, files: &[&str], found: &Judged) -> Self {
+    fn new(capture: &Capture, files: &[&str], found: &JudgedCameras) -> Self {
         let mut pairs: Vec<(Camera, Camera)> = Vec::new();
         for (file, camera) in files.iter().zip(found.cameras()) {
             if let (Some(truth), Some(solved)) = (capture.cameras.get(*file), camera) {
@@ -153,7 +153,7 @@ impl Compared {
         Self { placed: pairs.len(), rotation_deg, focal }
     }
 
-    fn outcome(&self, found: &Judged) -> &'static str {
+    fn outcome(&self, found: &JudgedCameras) -> &'static str {
         match &found.refused {
             Some(_) => "refused",
             None if self.rotation_deg <= RIGHT_DEG => "right",

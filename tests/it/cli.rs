@@ -308,7 +308,7 @@ fn photos_without_cameras_get_them_and_a_file_of_them() {
         let poses = cameras.flat_map(|one| one["camera_to_world"].as_array().unwrap());
         poses.map(|number| number.as_f64().unwrap()).collect()
     };
-    let apart = poses(&given).iter().zip(poses(&solved)).map(|(a, b)| (a - b).abs());
+    let apart = poses(&given).into_iter().zip(poses(&solved)).map(|(a, b)| (a - b).abs());
     assert!(apart.fold(0.0, f64::max) < 1e-9, "{given}\n{solved}");
     // Too few of them.
     std::fs::remove_dir_all(photos.join("images")).unwrap();

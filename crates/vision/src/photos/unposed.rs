@@ -7,7 +7,9 @@ use rayon::prelude::*;
 
 use super::{
     decode::{self, Header},
-    decoded_together, mask, side_kept, undistort,
+    mask,
+    room::{decoded_together, side_kept},
+    undistort,
 };
 use crate::{
     error::Result,

@@ -1,4 +1,4 @@
-//! The cameras of photos that came without: keypoints ▸ matches ▸ `segsplat_cameras` ▸ judgement.
+//! The cameras of photos that came without: keypoints ▸ matches ▸ `segsplat_cameras` ▸ judge.
 //!
 //! The solver sees keypoints alone. The judge is the plane sweep of `capture`, which compares the
 //! photos' pixels under the cameras: what it calls wrong of given cameras refuses solved ones.
@@ -11,7 +11,11 @@ use segsplat_cameras::{
     pairs_to_match, solve,
 };
 
-use super::{PhotoSet, Pipeline, networks::opened};
+use super::{
+    Pipeline, fraction,
+    networks::opened,
+    sets::{PhotoSet, UnposedSet, read_time},
+};
 use crate::{
     capture,
     error::{Error, ErrorCode, Result, short},
@@ -21,9 +25,8 @@ use crate::{
     models::FeatureNetwork,
     photos,
     scene::{
-        Camera, CamerasReport, CamerasSource, LeftOutPhoto, PlacedPhoto, PosedPhoto, SceneCamera,
-        SolvedCamera, Stage, StageTime, UnposedPhoto, Warning, WarningCode, Watch,
-        unless_cancelled,
+        Camera, CamerasReport, CamerasSource, LeftOutPhoto, PlacedPhoto, PosedPhoto, SolvedCamera,
+        Stage, StageTime, UnposedPhoto, Warning, WarningCode, Watch, unless_cancelled,
     },
 };
 
@@ -39,41 +42,9 @@ const NAMED_MAX: usize = 4;
 const REMEDY: &str = "Take more photos, each of which shows most of what the one before shows, of \
     things with texture; or send cameras with them";
 
-/// Photos of an upload without cameras.
-#[derive(Clone, Debug)]
-pub struct UnposedSet {
-    /// The photos, in the order of their names.
-    pub photos: Vec<UnposedPhoto>,
-    /// What of the upload was not used.
-    pub warnings: Vec<Warning>,
-    /// How long reading took, milliseconds.
-    pub read_ms: f64,
-}
-
-impl UnposedSet {
-    /// Bytes of the pixels.
-    #[must_use]
-    pub fn size_bytes(&self) -> u64 {
-        self.photos.iter().map(|unposed| super::bytes_of(&unposed.photo)).sum()
-    }
-
-    /// The photos of a scene that was made of these, with its cameras.
-    #[must_use]
-    pub fn posed_as(self, cameras: &[SceneCamera], report: &CamerasReport) -> PhotoSet {
-        let Self { mut photos, warnings, read_ms } = self;
-        let mut posed = Vec::with_capacity(cameras.len());
-        for (file, solved) in photos::solved(cameras, report) {
-            let Some(at) = photos.iter().position(|photo| photo.file == file) else { continue };
-            posed.push(photos::posed(photos.swap_remove(at), &solved));
-        }
-        let stages = vec![super::read_time(read_ms)];
-        PhotoSet { photos: posed, warnings, stages, cameras: report.clone() }
-    }
-}
-
 /// What the solver and the judge found: for whoever measures them.
 #[derive(Clone, Debug)]
-pub struct Judged {
+pub struct JudgedCameras {
     /// How likely the cameras are right, 0..1.
     pub confidence: f64,
     /// What the confidence is made of.
@@ -84,7 +55,7 @@ pub struct Judged {
     pub refused: Option<String>,
 }
 
-impl Judged {
+impl JudgedCameras {
     /// The camera of each photo, where it has one, in their order.
     pub fn cameras(&self) -> impl Iterator<Item = Option<Camera>> {
         self.placings.iter().map(|placing| match placing {
@@ -124,14 +95,18 @@ pub fn posed(pipeline: &Pipeline, set: UnposedSet, watch: Watch<'_>) -> Result<P
     meter::stage(Stage::Cameras.name(), ms / 1e3);
     (watch.progress)(Stage::Cameras, 1.0);
     let own = StageTime { stage: Stage::Cameras.name().to_owned(), ms };
-    Ok(PhotoSet { photos, warnings, stages: vec![super::read_time(read_ms), own], cameras })
+    Ok(PhotoSet { photos, warnings, stages: vec![read_time(read_ms), own], cameras })
 }
 
 /// What [`posed`] finds, and whether it would refuse it.
 ///
 /// # Errors
 /// As [`posed`], but for `cameras_unsolved`.
-pub fn judged(pipeline: &Pipeline, photos: &[UnposedPhoto], watch: Watch<'_>) -> Result<Judged> {
+pub fn judged(
+    pipeline: &Pipeline,
+    photos: &[UnposedPhoto],
+    watch: Watch<'_>,
+) -> Result<JudgedCameras> {
     let solution = solved(pipeline, photos, watch)?;
     let refused = match confirmed(pipeline, photos.to_vec(), &solution, watch) {
         Ok(_) => None,
@@ -139,7 +114,7 @@ pub fn judged(pipeline: &Pipeline, photos: &[UnposedPhoto], watch: Watch<'_>) ->
         Err(error) => return Err(error),
     };
     let Solution { confidence, evidence, photos: placings, .. } = solution;
-    Ok(Judged { confidence, evidence, placings, refused })
+    Ok(JudgedCameras { confidence, evidence, placings, refused })
 }
 
 /// The solver's answer.
@@ -150,7 +125,7 @@ fn solved(pipeline: &Pipeline, photos: &[UnposedPhoto], watch: Watch<'_>) -> Res
     let (mut keypoints, mut descriptors) = (Vec::new(), Vec::new());
     for (done, unposed) in photos.iter().enumerate() {
         unless_cancelled(cancel)?;
-        tell(KEYPOINTS_END * super::fraction(done, photos.len()));
+        tell(KEYPOINTS_END * fraction(done, photos.len()));
         let found = pipeline.workers.install(|| network.find(&unposed.photo))?;
         descriptors.push(Descriptors::new(&found.descriptors, found.dim));
         keypoints.push(PhotoKeypoints {
@@ -248,7 +223,9 @@ fn confirmed(
         message: format!("cameras: {message}"),
         value: confidence,
     };
-    let doubts = solution.warnings.iter().map(doubt).collect();
+    // Photos that were left out are named once.
+    let is_told = |message: &&String| left_out.iter().any(|of| message.contains(&of.reason));
+    let doubts = solution.warnings.iter().filter(|m| !is_told(m)).map(doubt).collect();
     let confidence = Some(confidence);
     let cameras = CamerasReport { source: CamerasSource::Solved, confidence, placed, left_out };
     Ok(Confirmed { photos: posed, cameras, doubts })

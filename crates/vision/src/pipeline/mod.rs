@@ -10,8 +10,12 @@ pub mod masks;
 mod networks;
 pub mod refinement;
 pub mod semantics;
+mod sets;
 
-pub use self::{cameras::UnposedSet, loader::PipelineLoader};
+pub use self::{
+    loader::PipelineLoader,
+    sets::{PhotoSet, ReadSet, UnposedSet},
+};
 
 use std::{
     path::Path,
@@ -30,7 +34,7 @@ use crate::{
     refine::split,
     scene::{
         Backdrop, Camera, CamerasMode, CamerasReport, Capture, Density, Gaussians, HealthReport,
-        Intrinsics, Method, Photo, PosedPhoto, Provenance, Scene, SceneCamera, SceneId, SceneMeta,
+        Intrinsics, Method, PosedPhoto, Provenance, Scene, SceneCamera, SceneId, SceneMeta,
         SceneOptions, Stage, StageTime, Upload, ViewGaussians, ViewSet, Warning, Watch,
         unless_cancelled,
     },
@@ -156,51 +160,6 @@ impl Reconstruction {
         let Self { gaussians, backdrop, report, cameras } = self;
         Scene::new(SceneMeta { id, created_ms, cameras, report, provenance }, gaussians, backdrop)
     }
-}
-
-/// The photos of an upload with their cameras, read and undistorted.
-#[derive(Clone, Debug)]
-pub struct PhotoSet {
-    /// The photos, in the order of the cameras.
-    pub photos: Vec<PosedPhoto>,
-    /// What of the upload was not used or not there.
-    pub warnings: Vec<Warning>,
-    /// How long the stages until here took.
-    pub stages: Vec<StageTime>,
-    /// Where the cameras come from.
-    pub cameras: CamerasReport,
-}
-
-impl PhotoSet {
-    /// Photos whose cameras were given, and how long reading them took, milliseconds.
-    #[must_use]
-    pub fn given(photos: Vec<PosedPhoto>, warnings: Vec<Warning>, read_ms: f64) -> Self {
-        let stages = vec![read_time(read_ms)];
-        Self { photos, warnings, stages, cameras: CamerasReport::default() }
-    }
-
-    /// Bytes of the pixels.
-    #[must_use]
-    pub fn size_bytes(&self) -> u64 {
-        self.photos.iter().map(|posed| bytes_of(&posed.photo)).sum()
-    }
-}
-
-fn bytes_of(photo: &Photo) -> u64 {
-    (photo.rgb.len() + photo.valid.as_ref().map_or(0, Vec::len)) as u64
-}
-
-fn read_time(ms: f64) -> StageTime {
-    StageTime { stage: Stage::Photos.name().to_owned(), ms }
-}
-
-/// The photos of an upload, with cameras or without.
-#[derive(Clone, Debug)]
-pub enum ReadSet {
-    /// Their cameras came with them.
-    Posed(PhotoSet),
-    /// Their cameras are to be solved: [`cameras::posed`].
-    Unposed(UnposedSet),
 }
 
 /// Reads an upload: the stage [`Stage::Photos`].
