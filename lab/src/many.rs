@@ -154,9 +154,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             // Where no version was better, what is served stays.
             row["refined_psnr"] = plain["served_psnr"].clone();
             let came = |(ms, version): &(f64, RefinedVersion)| {
-                Ok(
-                    json!({ "ms": ms, "psnr": judge(&version.gaussians)?, "report": version.report }),
-                )
+                let psnr = judge(&version.gaussians)?;
+                Ok(json!({ "ms": ms, "psnr": psnr, "report": version.report }))
             };
             row["versions"] = versions.iter().map(came).collect::<Result<Value>>()?;
             if let Some((_, version)) = versions.last() {

@@ -686,6 +686,10 @@ pub struct Method {
     /// Whether the embedding of a mask is also that of its place in the whole photo.
     #[prost(bool, optional, tag = "19")]
     pub context: ::core::option::Option<bool>,
+    /// Whether masks of different photos that lie on the same Gaussians share a row of the bank; else
+    /// K-Means makes the rows, with lambda, bank_rows and merge_cosine.
+    #[prost(bool, optional, tag = "20")]
+    pub tracks: ::core::option::Option<bool>,
 }
 /// One message of the upload.
 #[derive(Clone, PartialEq, ::prost::Message)]

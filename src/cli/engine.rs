@@ -60,7 +60,7 @@ pub fn models_info(bundle: &Bundle, execution_provider: &str) -> Result<ModelsIn
     let geometry = bundle.geometry();
     let models = bundle.files().into_iter().map(|entry| {
         let (views_max, sizes) = match entry.part {
-            "geometry" | "geometry.cpu" => (geometry.views_max, geometry.buckets.clone()),
+            part if part.starts_with("geometry") => (geometry.views_max, geometry.buckets.clone()),
             "masks.encoder" => (1, bundle.masks().map(|m| [m.size; 2]).into_iter().collect()),
             "image_text.image" => {
                 (1, bundle.image_text().map(|m| [m.image.size; 2]).into_iter().collect())

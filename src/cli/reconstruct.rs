@@ -24,6 +24,7 @@ use crate::{
     error::{Error, ErrorCode, Result},
     formats::table::ExportFormat,
     jobs::{Refiner, refine_options},
+    limits::Limits,
     names::named,
     pipeline::{
         self, PhotoSet, Pipeline, ReadSet, Seen, cameras, make_for_refinement,
@@ -111,7 +112,9 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         Refine::Off => None,
         _ => {
             let device = engine::renderer(config)?.differentiable();
-            let refiner = Refiner::new(device, config.threads, &config.limits)?;
+            // Nobody else waits for the processor.
+            let limits = Limits { refine_threads_percent: 100, ..config.limits.clone() };
+            let refiner = Refiner::new(device, config.threads, &limits)?;
             let ms = refiner.budget_ms(args.refine, photos.photos.len());
             ms.map(|ms| (refiner, refine_options(ms, &config.limits)))
         }

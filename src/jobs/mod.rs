@@ -15,6 +15,7 @@ mod photos;
 mod queue;
 mod records;
 mod refine;
+mod refiner;
 mod replicas;
 mod room;
 mod scene;
@@ -37,7 +38,7 @@ pub use self::networks::{
     NetworkState, NoSemantics, Phrases, PipelineNetworks, SceneNetworks, SemanticNetworks,
 };
 
-pub(crate) use self::refine::{Refiner, refine_options};
+pub(crate) use self::{refine::refine_options, refiner::Refiner};
 
 pub(crate) use self::shared::{JobParts, Jobs};
 

@@ -22,7 +22,7 @@ use super::{
     photos::{ReadUpload, ReadUploads},
     queue::{Full, Queue},
     records::Records,
-    refine::Refiner,
+    refiner::Refiner,
     room::Room,
 };
 use crate::{

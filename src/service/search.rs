@@ -122,10 +122,11 @@ impl Backend {
         let words = if listed { self.networks.rivals()? } else { Arc::default() };
         let scoring = Arc::new(Scoring::new(&method, canon, words)?);
         let bank = &of.semantics.bank;
-        let made = (method, Arc::new(Scorer::new(bank, scoring)?));
+        let made = (method, Arc::new(Scorer::new(bank, scoring)?.with_views(&of.semantics.views)?));
         let rows = bank.len() as u64;
-        // Rows, and the products of each two of them.
-        let bytes = 4 * bank.rows.len() as u64 + 4 * rows * (rows + 1);
+        // Rows with their views, and the products of each two of them.
+        let numbers = (bank.rows.len() + of.semantics.views.rows.len()) as u64;
+        let bytes = 4 * numbers + 4 * rows * (rows + 1);
         self.scorers.insert(key, made.clone(), bytes);
         Ok(made)
     }

@@ -356,9 +356,9 @@ impl Default for CallerLimits {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 #[schema(as = Model)]
 pub struct ModelInfo {
-    /// What it does: `geometry`, `geometry.cpu`, `masks.encoder`, `masks.decoder`,
-    /// `image_text.image`, `image_text.text`, `image_text.tokenizer`, `image_text.words`,
-    /// `features`.
+    /// What it does: `geometry`, `geometry.cpu`, `geometry.many`, `geometry.many.cpu`,
+    /// `masks.encoder`, `masks.decoder`, `image_text.image`, `image_text.text`,
+    /// `image_text.tokenizer`, `image_text.words`, `features`.
     pub name: String,
     /// File in the bundle.
     pub file: String,

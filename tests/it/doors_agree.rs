@@ -77,7 +77,6 @@ const NOT_ON_THE_PAGE: Absent = &[
     ("*.near_best", "scored as the scene was made; the cut alone is the page's"),
     ("*.rivals", "scored as the scene was made; the cut alone is the page's"),
     ("*.unit_rows", "scored as the scene was made; the cut alone is the page's"),
-    ("Scene.refinement", "it shows the version that is served when it is opened"),
     ("Scene.updated_ms", "it shows when a scene was made"),
     ("SemanticsStatus.available", "a question is refused with the reason"),
     ("SemanticsStatus.reason", "a question is refused with it"),

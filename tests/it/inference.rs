@@ -69,15 +69,20 @@ fn floats(name: &str, shape: &[usize]) -> Tensor {
 fn inputs(network: &str) -> Vec<Tensor> {
     let identity = |n: usize| (0..n * n).map(move |i| f32::from(u8::from(i % (n + 1) == 0)));
     let poses = |views: usize, n: usize| (0..views).flat_map(|_| identity(n)).collect();
+    let geometry = |views: usize| {
+        let next = |view: usize| i64::try_from((view + 1) % views).unwrap();
+        vec![
+            floats("images", &[views, 3, 32, 48]),
+            tensor("intrinsics", &[views, 3, 3], TensorData::F32(poses(views, 3))),
+            tensor("camera_to_world", &[views, 4, 4], TensorData::F32(poses(views, 4))),
+            tensor("near", &[views], TensorData::F32(vec![1.0; views])),
+            tensor("far", &[views], TensorData::F32(vec![9.0; views])),
+            tensor("neighbors", &[views, 1], TensorData::I64((0..views).map(next).collect())),
+        ]
+    };
     match network {
-        "geometry" => vec![
-            floats("images", &[2, 3, 32, 48]),
-            tensor("intrinsics", &[2, 3, 3], TensorData::F32(poses(2, 3))),
-            tensor("camera_to_world", &[2, 4, 4], TensorData::F32(poses(2, 4))),
-            tensor("near", &[2], TensorData::F32(vec![1.0, 1.5])),
-            tensor("far", &[2], TensorData::F32(vec![9.0, 8.5])),
-            tensor("neighbors", &[2, 1], TensorData::I64(vec![1, 0])),
-        ],
+        "geometry" => geometry(2),
+        "geometry.many" => geometry(5),
         "masks.encoder" => vec![floats("images", &[1, 3, 64, 64])],
         "image_text.image" => vec![floats("images", &[3, 3, 16, 16])],
         "image_text.text" => vec![
@@ -362,7 +367,7 @@ async fn both_doors_say_what_is_there() {
         assert_eq!((&body["code"], &body["error"]), (&json!(code), &body["message"]), "{path}");
     }
     let unknown = get("/v2/models/nothing").await.unwrap_err();
-    assert!(unknown.message.contains("geometry, masks.encoder, masks.decoder"), "{unknown:?}");
+    assert!(unknown.message.contains("geometry, geometry.many, masks.encoder"), "{unknown:?}");
     let version = ModelReadyRequest { name: "geometry".to_owned(), version: "2".to_owned() };
     assert_eq!(fault_of(client.model_ready(version).await.unwrap_err()).code, "not_found");
 }

@@ -18,7 +18,7 @@ use segsplat::{
     limits::Limits,
     render::{Kinds, RenderRequest, Renderer as _, compare::psnr, cpu::CpuRenderer},
     scene::{
-        Bank, BankMask, Gaussians, IndexMap, SanitizeReport, SceneOptions, Semantics,
+        Bank, BankMask, Gaussians, IndexMap, RowViews, SanitizeReport, SceneOptions, Semantics,
         SemanticsReport,
     },
 };
@@ -221,6 +221,7 @@ fn semantics() -> Semantics {
     let masks = [(0, 0, 1), (0, 1, 2), (1, 0, 1)];
     Semantics {
         bank: Bank { dim: 2, rows: vec![0.5, 0.25, -1.0, 3.0] },
+        views: RowViews { entries: vec![1, 1], rows: vec![1.0, 0.0, 0.0, 1.0] },
         index: (0..50).map(|i| i % 3).collect(),
         photos: vec![IndexMap { width: 2, height: 1, index: vec![1, 2] }],
         masks: masks.map(|(photo, mask, entry)| BankMask { photo, mask, entry }).to_vec(),

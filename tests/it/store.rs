@@ -15,8 +15,9 @@ use segsplat::{
     limits::Limits,
     scene::{
         Backdrop, Bank, BankMask, Gaussians, HealthReport, IndexMap, PhotoHash, Provenance,
-        RawGaussians, SanitizeReport, Scene, SceneId, SceneMeta, SceneOptions, SceneState,
-        SceneStatus, Semantics, SemanticsReport, SourcePixel, Upload, UploadCameras, UploadFile,
+        RawGaussians, RowViews, SanitizeReport, Scene, SceneId, SceneMeta, SceneOptions,
+        SceneState, SceneStatus, Semantics, SemanticsReport, SourcePixel, Upload, UploadCameras,
+        UploadFile,
     },
     store::{KeyUse, Record, Store, StoreLocation, provenance, request_sha256},
 };
@@ -244,7 +245,8 @@ fn damaged_containers_are_refused_by_name() {
     let map = IndexMap { width: 3, height: 2, index: vec![0, 1, 2, 0, 1, 2] };
     let masks = vec![BankMask { photo: 0, mask: 0, entry: 1 }];
     let (index, report) = (vec![1; 40], SemanticsReport::default());
-    let semantics = Semantics { bank, index, photos: vec![map], masks, report };
+    let views = RowViews { entries: vec![1, 2], rows: vec![0.5; 6] };
+    let semantics = Semantics { bank, views, index, photos: vec![map], masks, report };
     let mut file = Vec::new();
     write_semantics(&mut file, &id, &semantics).unwrap();
     let mut of_semantics = damaged_containers(&file, "bank");
@@ -256,6 +258,10 @@ fn damaged_containers_are_refused_by_name() {
         (retold(&file, "/maps", json!([[u32::MAX, u32::MAX]])), "cut short"),
         (rewritten(&file, "bank", &nan), "finite"),
         (rewritten(&file, "masks", &[0, 0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0]), "no row of the bank"),
+        (rewritten(&file, "views", &nan), "the views"),
+        (rewritten(&file, "view_entries", &[2, 0, 1, 0]), "the views"),
+        (rewritten(&file, "view_entries", &[0, 0, 1, 0]), "the views"),
+        (rewritten(&file, "view_entries", &[1, 0, 3, 0]), "the views"),
     ]);
     let read = |file: &[u8], is_scene: bool| match is_scene {
         true => read_scene(file).map(drop),
@@ -296,7 +302,7 @@ fn what_another_version_wrote_is_told_from_damage_and_is_left_as_it_is() {
     let bank = Bank { dim: 3, rows: vec![0.5; 6] };
     let (index, photos) = (vec![1; 30], Vec::new());
     let report = SemanticsReport::default();
-    let semantics = Semantics { bank, index, photos, masks: Vec::new(), report };
+    let semantics = Semantics { bank, index, photos, report, ..Semantics::default() };
     let mut meaning = Vec::new();
     write_semantics(&mut meaning, &id(3), &semantics).unwrap();
     drop(store);
@@ -602,6 +608,7 @@ fn a_ply_carries_index_and_bank_together_and_programs_that_know_no_bank_stop_bef
     let masks = masks.map(|(photo, mask, entry)| BankMask { photo, mask, entry }).to_vec();
     let semantics = Semantics {
         bank: Bank { dim: 2, rows: vec![0.5, 0.25, -1.0, 3.0] },
+        views: RowViews { entries: vec![1, 2], rows: vec![0.5, 0.25, -1.0, 3.0] },
         index,
         photos: vec![IndexMap { width: 2, height: 1, index: vec![1, 2] }],
         masks,

@@ -209,7 +209,7 @@ fn the_place_in_the_whole_photo_is_added_to_each_crop() {
         cancel: &NO_CANCEL,
     };
     let with = SemanticsTools { context, ..tools(masks, &colour_of) };
-    let method = Method { bank_rows: 2, merge_cosine: 0.0, ..Method::default() };
+    let method = Method { tracks: false, bank_rows: 2, merge_cosine: 0.0, ..Method::default() };
     let whole = understand_with(&with, &wall.parts(), &method, watch).unwrap();
     assert_eq!(*asked.lock().unwrap(), [32], "a photo without masks is not looked at");
     let told = told.into_inner().unwrap();
@@ -282,7 +282,7 @@ fn two_sides_of_one_thing_are_joined_only_when_asked() {
         Ok(vec![1.0, 0.0, 0.0, 0.6, 0.8, 0.0])
     };
     // 1.2 masks a photo make two rows.
-    let with = |merge_cosine| Method { merge_cosine, ..Method::default() };
+    let with = |merge_cosine| Method { tracks: false, merge_cosine, ..Method::default() };
     let apart = made(&wall, &tools(masks, embed), &with(0.0)).unwrap();
     assert_eq!((apart.bank.len(), apart.index[0] == apart.index[300]), (2, false));
     let strict = made(&wall, &tools(masks, embed), &with(0.7)).unwrap();
@@ -292,6 +292,38 @@ fn two_sides_of_one_thing_are_joined_only_when_asked() {
     assert!(joined.index.iter().all(|m| *m == 1));
     assert_eq!(joined.photos[1].index, [1]);
     assert_eq!(joined.bank.rows, [0.8, 0.4, 0.0], "the mean of both");
+}
+
+#[test]
+fn masks_of_one_thing_are_a_row_whatever_each_looks_like() {
+    let wall = wall();
+    // The larger mask of each photo is the second one.
+    let masks: Masks<'_> = &|_| {
+        let mut masks: Vec<PhotoMasks> = (0..2).map(two_masks).collect();
+        masks.iter_mut().for_each(|of| of.masks[1].area = 0.5);
+        Ok(masks)
+    };
+    let looks = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]];
+    let embedded = Mutex::new(looks.iter());
+    let embed: Embed<'_> = &|crops| {
+        let mut next = embedded.lock().unwrap();
+        Ok(crops.iter().flat_map(|_| *next.next().unwrap()).collect())
+    };
+    let made = made(&wall, &tools(masks, embed), &Method::default()).unwrap();
+    // Photo 0 has masks 0 (left) and 1 (right), photo 1 masks 2 (right) and 3 (left) of them all.
+    let [left, right] = [0, 15].map(|i| usize::from(made.index[i]));
+    assert_eq!((made.bank.len(), made.report.bank_size), (2, 2));
+    let of_row = |entry: usize| -> Vec<[f32; 3]> {
+        let all = made.views.entries.iter().zip(made.views.rows.as_chunks::<3>().0);
+        all.filter(|(m, _)| usize::from(**m) == entry).map(|(_, row)| *row).collect()
+    };
+    assert_eq!(of_row(right), [looks[1], looks[2]].map(|row| row));
+    assert_eq!(of_row(left), [looks[3], looks[0]], "the larger mask first");
+    assert_eq!(made.bank.row(right - 1), [0.0, 0.5, 0.5], "the mean");
+    assert_eq!(
+        made.masks.iter().map(|m| usize::from(m.entry)).collect::<Vec<_>>(),
+        [left, right, right, left]
+    );
 }
 
 #[test]

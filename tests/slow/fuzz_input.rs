@@ -33,8 +33,8 @@ use segsplat::{
     render::cpu::CpuRenderer,
     sample::{self, SampleOptions},
     scene::{
-        Backdrop, Bank, HealthReport, IndexMap, Provenance, Scene, SceneId, SceneMeta, Semantics,
-        SemanticsReport, Upload, UploadCameras,
+        Backdrop, Bank, HealthReport, IndexMap, Provenance, RowViews, Scene, SceneId, SceneMeta,
+        Semantics, SemanticsReport, Upload, UploadCameras,
     },
 };
 use segsplat_testing::captures;
@@ -361,6 +361,7 @@ fn semantics() -> Semantics {
     let report = SemanticsReport::default();
     Semantics {
         bank,
+        views: RowViews { entries: vec![1, 2], rows: vec![0.5; 6] },
         index: vec![1; 20],
         photos: vec![map.clone(), map],
         masks: Vec::new(),

@@ -1,7 +1,10 @@
 //! Solves match files and compares the cameras with given ones: `solve_scenes FILE.xm…`.
 //!
-//! `FOCAL=1` gives the true focal length, `SETS=4,8,16` the numbers of photos, `STARTS` how many runs
-//! of neighbours.
+//! `FOCAL=1` gives the true focal length, `SETS=4,8,16` the numbers of photos, `STARTS` how many sets
+//! of each. Little-endian files: `XM01`, the number of photos, for each photo width and height (u32),
+//! fx, cx, cy and the first three rows of the OpenCV camera-to-world (f64), the number of keypoints
+//! and their x and y (f32); the number of pairs, for each two photos, the number of matches, and for
+//! each match two keypoints (u32) and its score (f32).
 #![allow(
     clippy::print_stdout,
     clippy::unwrap_used,
@@ -146,8 +149,9 @@ fn run(file: &File, set: &[usize], name: &str, with_focal: bool) {
     let max = errors.last().copied().unwrap_or(f64::NAN);
     let e = solution.evidence;
     println!(
-        "{name:20} {:3} {:6} {median:7.2} {max:7.2} {:6.3} | {:5.2} links {} agree {:.2} expl {:.2} \
-         rival {:.2} mirr {:.2} held {} {} angle {:.1} err {:.2} loops {:.2} miss {:.2} weak {:.2} t {seconds:.2}",
+        "{name:20} {:3} {:6} {median:7.2} {max:7.2} {:6.3} | {:5.2} links {} agree {:.2} \
+         expl {:.2} rival {:.2} mirr {:.2} held {} {} angle {:.1} err {:.2} loops {:.2} miss {:.2} \
+         weak {:.2} t {seconds:.2}",
         set.len(),
         placed.len(),
         placed.first().map_or(f64::NAN, |p| p.2),

@@ -261,8 +261,8 @@ fn from_eliminated(m: &SMatrix<f64, 10, 20>, basis: &[SVector<f64, 9>; 4]) -> Ve
     found
 }
 
-/// The four poses of the second camera (the first is the identity, the distance 1) that an essential
-/// matrix leaves open.
+/// The four poses of the second camera (the first is the identity, the distance 1) that an
+/// essential matrix leaves open.
 pub(crate) fn poses_of(e: &Matrix3<f64>) -> Option<[Pose; 4]> {
     let svd = e.try_svd(true, true, 1e-14, 200)?;
     let (mut u, mut v_t) = (svd.u?, svd.v_t?);

@@ -1,6 +1,8 @@
 //! Cameras one after the other from a first pair: each next photo by the points that it sees, each
 //! time with new points, an adjustment, and what does not fit taken out.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use nalgebra::{Matrix3, Vector2, Vector3};
 
 use crate::{
@@ -20,8 +22,8 @@ const PLACED_SHARE: f64 = 0.3;
 /// [`TURN_MAX_DEG`].
 const CONFIRMED_SHARE: f64 = 0.1;
 const TURN_MAX_DEG: f64 = 10.0;
-/// Links that place a photo by themselves: their share of matches, their matches; and the points that
-/// must agree on the distance.
+/// Links that place a photo by themselves: their share of matches, their matches; and the points
+/// that must agree on the distance.
 const SURE_SHARE: f64 = 0.5;
 const SURE_INLIERS: usize = 60;
 const BY_LINK_MIN: usize = 5;
@@ -47,6 +49,7 @@ pub(crate) struct Grower<'a> {
     pub(crate) survey: &'a Survey,
     pub(crate) tracks: &'a [Vec<Sighting>],
     pub(crate) links: &'a [Link],
+    pub(crate) cancel: &'a AtomicBool,
     pub(crate) state: Grown,
 }
 
@@ -56,6 +59,7 @@ impl<'a> Grower<'a> {
         tracks: &'a [Vec<Sighting>],
         links: &'a [Link],
         lenses: &[Lens],
+        cancel: &'a AtomicBool,
     ) -> Self {
         let state = Grown {
             poses: vec![None; survey.views.len()],
@@ -63,7 +67,7 @@ impl<'a> Grower<'a> {
             points: vec![None; tracks.len()],
             agrees: tracks.iter().map(|track| vec![false; track.len()]).collect(),
         };
-        Self { survey, tracks, links, state }
+        Self { survey, tracks, links, cancel, state }
     }
 
     /// Grows from two photos and the pose of the second from the first.
@@ -78,11 +82,18 @@ impl<'a> Grower<'a> {
 
     /// Places photos until none fits, then adjusts everything.
     pub(crate) fn place_all(&mut self, seed: u64) {
-        while let Some((photo, pose)) = self.next_photo(seed).or_else(|| self.next_by_link()) {
+        let mut adjusted = self.placed();
+        while !self.cancel.load(Ordering::Relaxed)
+            && let Some((photo, pose)) = self.next_photo(seed).or_else(|| self.next_by_link())
+        {
             self.state.poses[photo] = Some(pose);
             self.triangulate();
-            self.adjust(4);
-            self.filter();
+            // Among many photos one more changes little.
+            if self.placed() > adjusted + adjusted / 16 {
+                self.adjust(4);
+                self.filter();
+                adjusted = self.placed();
+            }
         }
         self.settle();
     }
@@ -121,13 +132,27 @@ impl<'a> Grower<'a> {
         (pixel - self.pixel(sighting)).norm_squared() / (agree * agree)
     }
 
-    /// Known points that an unplaced photo may see.
-    fn seen_by(&self, photo: usize) -> Vec<Seen> {
-        let mut seen = Vec::new();
+    /// Sightings, of those that agreed before, that still do.
+    pub(crate) fn agreeing(&self) -> usize {
+        let tracks = self.tracks.iter().zip(&self.state.agrees).zip(&self.state.points);
+        let each = tracks.filter_map(|(track, point)| Some((track, point.as_ref()?)));
+        let near = each.map(|((track, agrees), point)| {
+            let own = track.iter().zip(agrees).filter(|(_, agrees)| **agrees);
+            own.filter(|(sighting, _)| self.error2(**sighting, point) < 1.0).count()
+        });
+        near.sum()
+    }
+
+    /// Known points that each unplaced photo may see.
+    fn seen(&self) -> Vec<Vec<Seen>> {
+        let mut seen: Vec<Vec<Seen>> = vec![Vec::new(); self.state.poses.len()];
         for (track, point) in self.tracks.iter().zip(&self.state.points) {
             let Some(point) = point else { continue };
-            if let Some(sighting) = track.iter().find(|s| s.0 as usize == photo) {
-                seen.push(Seen { point: *point, pixel: self.pixel(*sighting) });
+            for sighting in track {
+                let photo = sighting.0 as usize;
+                if self.state.poses[photo].is_none() {
+                    seen[photo].push(Seen { point: *point, pixel: self.pixel(*sighting) });
+                }
             }
         }
         seen
@@ -152,9 +177,10 @@ impl<'a> Grower<'a> {
 
     /// The photo that sees the known points best, and its pose.
     fn next_photo(&self, seed: u64) -> Option<(usize, Pose)> {
-        let mut waiting: Vec<(usize, usize, Vec<Seen>)> = (0..self.state.poses.len())
-            .filter(|&photo| self.state.poses[photo].is_none())
-            .map(|photo| (photo, self.seen_by(photo)))
+        let mut waiting: Vec<(usize, usize, Vec<Seen>)> = self
+            .seen()
+            .into_iter()
+            .enumerate()
             .filter(|(_, seen)| seen.len() as f64 >= PLACED_MIN)
             .map(|(photo, seen)| (self.coverage(photo, &seen), photo, seen))
             .collect();
@@ -247,13 +273,14 @@ impl<'a> Grower<'a> {
         };
         let mut open: Vec<_> = self.links.iter().filter(sure).filter_map(ends).collect();
         open.sort_by(|a, b| b.0.strength().total_cmp(&a.0.strength()));
-        open.into_iter()
-            .find_map(|(_, photo, from, step)| Some((photo, self.at_distance(photo, from, &step)?)))
+        let seen = if open.is_empty() { Vec::new() } else { self.seen() };
+        open.into_iter().find_map(|(_, photo, from, step)| {
+            Some((photo, self.at_distance(photo, &seen[photo], from, &step)?))
+        })
     }
 
     /// The pose `step` away from a placed one, at the distance that most known points agree with.
-    fn at_distance(&self, photo: usize, from: &Pose, step: &Pose) -> Option<Pose> {
-        let seen = self.seen_by(photo);
+    fn at_distance(&self, photo: usize, seen: &[Seen], from: &Pose, step: &Pose) -> Option<Pose> {
         let lens = self.lens(photo as u32);
         let at =
             |distance: f64| Pose { r: step.r * from.r, t: step.r * from.t + step.t * distance };

@@ -1,5 +1,7 @@
 //! How far a solution can be trusted.
 
+use std::sync::atomic::AtomicBool;
+
 use nalgebra::{Matrix3, Vector3};
 
 use crate::{
@@ -11,6 +13,8 @@ use crate::{
     tracks::Sighting,
 };
 
+/// What is short is not cancelled.
+static NEVER: AtomicBool = AtomicBool::new(false);
 /// Solutions whose cameras are turned against each other by more than this differ, degrees.
 const DIFFERENT_DEG: f64 = 5.0;
 
@@ -21,14 +25,15 @@ const POINTS_IN_BOTH_MIN: usize = 60;
 /// Under this number of near pairs nothing is said of those that did not match.
 const NEAR_PAIRS_MIN: u32 = 3;
 
-/// Confidence in two photos at most: nothing confirms a pair.
+/// Confidence in two photos at most: nothing confirms a pair, and it does not tell a focal length.
 const TWO_PLACED: f64 = 0.4;
+const TWO_PLACED_FOCAL_KNOWN: f64 = 0.7;
 /// Where each kind of doubt halves the confidence; chosen on seven scenes (`docs/adr`, number 71).
 pub(crate) const WEAKEST_MIN: f64 = 0.5;
 const AGREEING_MIN: f64 = 0.75;
 pub(crate) const EXPLAINED_MIN: f64 = 0.8;
 pub(crate) const RIVAL_MAX: f64 = 0.95;
-pub(crate) const MIRRORED_MAX: f64 = 0.95;
+pub(crate) const MIRRORED_MAX: f64 = 0.92;
 pub(crate) const MISSING_MAX: f64 = 0.55;
 pub(crate) const LOOPS_MIN: f64 = 0.15;
 /// Photos from which on the links of a photo are counted, and how many there must be.
@@ -51,16 +56,17 @@ pub(crate) fn difference_deg(a: &Grown, b: &Grown) -> Option<f64> {
     angles.get(angles.len() / 2).copied()
 }
 
-/// The scene inside out: what a distant camera can hardly tell from it. `None` where too few fit.
-pub(crate) fn mirrored(survey: &Survey, best: &Candidate) -> Option<Grown> {
+/// The scene inside out, adjusted: what a distant camera can hardly tell from it. The share of the
+/// sightings that still agree, where it is another solution.
+fn mirrored(survey: &Survey, best: &Candidate) -> f64 {
     let points: Vec<Vector3<f64>> = best.grown.points.iter().flatten().copied().collect();
-    let reference = best.grown.poses.iter().flatten().next()?;
+    let Some(reference) = best.grown.poses.iter().flatten().next() else { return 0.0 };
     let n = points.len().max(1) as f64;
     let middle = points.iter().sum::<Vector3<f64>>() / n;
     // World axes of the reference camera, origin in the middle of the points.
     let to_frame = |p: &Vector3<f64>| reference.r * (p - middle);
     let flip = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, -1.0));
-    let mut grower = Grower::new(survey, &best.tracks, &[], &best.grown.lenses);
+    let mut grower = Grower::new(survey, &best.tracks, &[], &best.grown.lenses, &NEVER);
     grower.state = best.grown.clone();
     for point in grower.state.points.iter_mut().flatten() {
         *point = flip * to_frame(point);
@@ -70,12 +76,10 @@ pub(crate) fn mirrored(survey: &Survey, best: &Candidate) -> Option<Grown> {
         let t = pose.r * middle + pose.t;
         *pose = Pose { r: flip * r * flip, t };
     }
-    for _ in 0..3 {
-        grower.adjust(12);
-        grower.filter();
-        grower.triangulate();
-    }
-    (grower.placed() >= 2).then_some(grower.state)
+    grower.adjust(30);
+    let other = difference_deg(&best.grown, &grower.state).is_some_and(|d| d > DIFFERENT_DEG);
+    let all = best.grown.agrees.iter().flatten().filter(|agrees| **agrees).count();
+    if other { grower.agreeing() as f64 / all.max(1) as f64 } else { 0.0 }
 }
 
 /// A number that goes from 0 to 1 about `middle`, nearly all of it within three times `width`.
@@ -88,8 +92,11 @@ pub(crate) fn confidence(evidence: &Evidence) -> f64 {
     if evidence.placed < 2 {
         return 0.0;
     }
-    let few =
-        if evidence.placed == 2 { TWO_PLACED } else { rising(evidence.held as f64, HELD_MIN, 6.0) };
+    let few = match (evidence.placed, evidence.focal_known) {
+        (2, true) => TWO_PLACED_FOCAL_KNOWN,
+        (2, false) => TWO_PLACED,
+        _ => rising(evidence.held as f64, HELD_MIN, 6.0),
+    };
     // A long chain without loops adds up its errors, and nothing shows them.
     let links = evidence.links as f64 / (evidence.placed - 1) as f64;
     let held = if evidence.placed < CHAIN_PLACED { 1.0 } else { rising(links, CHAIN_LINKS, 0.1) };
@@ -142,9 +149,7 @@ pub(crate) fn evidence(
         })
         .map(|other| fit(best, &other.grown, &other.tracks) / own_fit)
         .fold(0.0, f64::max);
-    let mirrored = mirrored(survey, best)
-        .filter(|other| difference_deg(grown, other).is_some_and(|angle| angle > DIFFERENT_DEG))
-        .map_or(0.0, |other| fit(best, &other, &best.tracks) / own_fit);
+    let mirrored = mirrored(survey, best);
     let mut held = vec![0; grown.poses.len()];
     let mut angles = Vec::new();
     let mut errors = Vec::new();
@@ -203,6 +208,11 @@ pub(crate) fn evidence(
             .map(|(share, _)| *share)
             .fold(1.0, f64::min),
         placed: of_placed.len(),
+        focal_known: survey
+            .views
+            .iter()
+            .zip(&grown.poses)
+            .all(|(view, pose)| pose.is_none() || survey.priors[view.lens].known),
     }
 }
 

@@ -1,5 +1,5 @@
-//! From matched keypoints of photos to their cameras: poses, focal lengths, a sparse cloud of points,
-//! and a confidence that says whether they can be trusted.
+//! From matched keypoints of photos to their cameras: poses, focal lengths, a sparse cloud of
+//! points, and a confidence that says whether they can be trusted.
 //!
 //! Pixels are those of `segsplat_core`: the centre of the top left pixel is (0.5, 0.5). Cameras are
 //! OpenCV camera-to-world. Nothing here reads a photo or runs a network.

@@ -7,8 +7,8 @@ const NEIGHBOURS: usize = 6;
 /// Photos most alike, beyond [`ALL_MAX`].
 const ALIKE: usize = 8;
 
-/// Pairs (i < j) of `count` photos to match: all of up to 40, else neighbours in order, some further
-/// ones, and for each photo those most alike by `alike` (the larger the more).
+/// Pairs (i < j) of `count` photos to match: all of up to 40, else neighbours in order, some
+/// further ones, and for each photo those most alike by `alike` (the larger the more).
 pub fn pairs_to_match(count: usize, alike: impl Fn(usize, usize) -> f32) -> Vec<[usize; 2]> {
     let mut pairs = Vec::new();
     if count <= ALL_MAX {

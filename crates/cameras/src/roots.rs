@@ -44,7 +44,8 @@ fn roots_between(p: &[f64]) -> Vec<f64> {
     roots
 }
 
-/// The root of `p` in [low, high], where it is monotonic: Newton's steps, bisection where they leave.
+/// The root of `p` in [low, high], where it is monotonic: Newton's steps, bisection where they
+/// leave.
 fn root_between(p: &[f64], slope: &[f64], mut low: f64, mut high: f64) -> Option<f64> {
     let (at_low, at_high) = (value(p, low), value(p, high));
     if at_low == 0.0 {

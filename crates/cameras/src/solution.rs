@@ -62,7 +62,8 @@ pub const CONFIDENCE_MIN: f64 = 0.5;
 pub struct Evidence {
     /// Pairs of placed photos whose matches fit one geometry of two views.
     pub links: usize,
-    /// Share of these pairs, by their matches, that are turned as the cameras are, within 5 degrees.
+    /// Share of these pairs, by their matches, that are turned as the cameras are, within 5
+    /// degrees.
     pub agreeing: f64,
     /// Share of the matches of these pairs that the cameras explain.
     pub explained: f64,
@@ -76,7 +77,8 @@ pub struct Evidence {
     pub held_median: usize,
     /// Median of the widest angle at which a point is seen, degrees.
     pub angle_deg: f64,
-    /// Median distance of keypoints from their points, in units of the distance at which they agree.
+    /// Median distance of keypoints from their points, in units of the distance at which they
+    /// agree.
     pub error: f64,
     /// Share of the loops of three such pairs whose turns close, within 5 degrees. 1 where there is
     /// no loop.
@@ -88,4 +90,6 @@ pub struct Evidence {
     pub weakest: f64,
     /// Photos placed.
     pub placed: usize,
+    /// Whether the focal lengths of all of them are from EXIF.
+    pub focal_known: bool,
 }

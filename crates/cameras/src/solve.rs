@@ -44,7 +44,7 @@ pub fn solve(
             warnings: vec!["no two photos show enough of the same things".to_owned()],
         });
     };
-    let (links, dropped) = solver::drop_weak(&survey, &mut best);
+    let (links, dropped) = solver::drop_weak(&survey, &mut best, cancel);
     let others: Vec<solver::Candidate> = candidates.collect();
     let evidence = judge::evidence(&survey, &best, &links, &others);
     let why_not = |photo| report::why_left_out(&survey, photo, &dropped);

@@ -25,13 +25,15 @@ const FOCAL_USUAL: f64 = 0.8;
 const FOCAL_USUAL_SPREAD: f64 = 0.5;
 const FOCAL_EXIF_SPREAD: f64 = 0.03;
 const K1_SPREAD: f64 = 0.1;
-/// First pairs that are tried for each focal length.
+/// First pairs that are tried for each focal length, and for more than [`PHOTOS_MANY`] photos.
 const SEEDS: usize = 4;
+const SEEDS_OF_MANY: usize = 2;
+const PHOTOS_MANY: usize = 32;
 /// A pair is a link of the view graph where chance gives so many such agreements at most.
 const LOG_CHANCE_MAX: f64 = -8.0;
 const LINK_INLIERS_MIN: usize = 15;
-/// A photo is held by a pair of which the cameras explain this share at least. Photos that only look
-/// alike agree in a third of their matches by the outline of things.
+/// A photo is held by a pair of which the cameras explain this share at least. Photos that only
+/// look alike agree in a third of their matches by the outline of things.
 const WEAK_SHARE: f64 = 0.42;
 
 /// A solution and what it was made from.
@@ -112,7 +114,7 @@ pub(crate) fn candidates(
         let links = survey.links(&lenses, 60, Some(&first));
         let links: Vec<Link> = links.into_iter().flatten().filter(is_link).collect();
         let links = rotations::consistent(survey.views.len(), &links);
-        all.extend(grow_from_pairs(survey, &lenses, &links));
+        all.extend(grow_from_pairs(survey, &lenses, &links, cancel));
     }
     all.sort_by(|a, b| b.score.total_cmp(&a.score));
     unless_cancelled(cancel)?;
@@ -123,7 +125,11 @@ pub(crate) fn candidates(
 /// Takes photos out of a solution that no pair holds: in which the cameras explain less than
 /// [`WEAK_SHARE`] of the matches with any other photo. Returns the links under the final lenses and
 /// the photos that were taken out.
-pub(crate) fn drop_weak(survey: &Survey, best: &mut Candidate) -> (Vec<Link>, Vec<usize>) {
+pub(crate) fn drop_weak(
+    survey: &Survey,
+    best: &mut Candidate,
+    cancel: &AtomicBool,
+) -> (Vec<Link>, Vec<usize>) {
     let mut dropped = Vec::new();
     loop {
         let links = links_under(survey, best);
@@ -136,7 +142,7 @@ pub(crate) fn drop_weak(survey: &Survey, best: &mut Candidate) -> (Vec<Link>, Ve
         if weak.is_empty() || 2 * weak.len() > placed {
             return (links, dropped);
         }
-        let mut grower = Grower::new(survey, &best.tracks, &[], &best.grown.lenses);
+        let mut grower = Grower::new(survey, &best.tracks, &[], &best.grown.lenses, cancel);
         grower.state = best.grown.clone();
         for photo in &weak {
             grower.state.poses[*photo] = None;
@@ -209,7 +215,12 @@ fn lenses_to_try(survey: &Survey, known: &[Lens], first: &[Option<Link>]) -> Vec
 }
 
 /// Solutions from several first pairs.
-fn grow_from_pairs(survey: &Survey, lenses: &[Lens], links: &[Link]) -> Vec<Candidate> {
+fn grow_from_pairs(
+    survey: &Survey,
+    lenses: &[Lens],
+    links: &[Link],
+    cancel: &AtomicBool,
+) -> Vec<Candidate> {
     let counts: Vec<usize> = survey.views.iter().map(|v| v.pixels.len()).collect();
     let mut order: Vec<&Link> = links.iter().collect();
     order.sort_by(|a, b| b.geometry.score.total_cmp(&a.geometry.score).then(a.pair.cmp(&b.pair)));
@@ -222,11 +233,12 @@ fn grow_from_pairs(survey: &Survey, lenses: &[Lens], links: &[Link]) -> Vec<Cand
         })
     });
     let tracks = tracks::join(&counts, sightings);
-    let seeds = first_pairs(links);
+    let many = survey.views.len() > PHOTOS_MANY;
+    let seeds = first_pairs(links, if many { SEEDS_OF_MANY } else { SEEDS });
     let grown: Vec<Candidate> = seeds
         .par_iter()
         .filter_map(|link| {
-            let mut grower = Grower::new(survey, &tracks, links, lenses);
+            let mut grower = Grower::new(survey, &tracks, links, lenses, cancel);
             grower.grow(link.photos, link.geometry.pose, survey.seed);
             (grower.placed() >= 2).then(|| Candidate {
                 score: score_of(survey, links, &grower.state),
@@ -241,7 +253,7 @@ fn grow_from_pairs(survey: &Survey, lenses: &[Lens], links: &[Link]) -> Vec<Cand
 
 /// Pairs to start from: many matches, rays that meet at a wide angle, and no two of the same photo
 /// where it can be avoided.
-fn first_pairs(links: &[Link]) -> Vec<Link> {
+fn first_pairs(links: &[Link], count: usize) -> Vec<Link> {
     let worth = |link: &Link| {
         let geometry = &link.geometry;
         let parallax = geometry.inliers.len() as f64 * (1.0 - geometry.rotation_share);
@@ -253,12 +265,12 @@ fn first_pairs(links: &[Link]) -> Vec<Link> {
     let mut picked: Vec<Link> = Vec::new();
     for link in &order {
         let new = picked.iter().all(|p| p.photos.iter().all(|x| !link.photos.contains(x)));
-        if picked.len() < SEEDS && new {
+        if picked.len() < count && new {
             picked.push((*link).clone());
         }
     }
     for link in order {
-        if picked.len() < SEEDS && picked.iter().all(|p| p.pair != link.pair) {
+        if picked.len() < count && picked.iter().all(|p| p.pair != link.pair) {
             picked.push(link.clone());
         }
     }

@@ -95,7 +95,7 @@ pub(super) fn judge(
 
 /// The parts that a text selects, as a query gives them: the best first.
 fn parts(tools: &Tools<'_>, made: &Made, way: &Way, text: &str) -> Result<Vec<Instance>> {
-    let scorer = Scorer::new(&made.bank, way.scoring.clone())?;
+    let scorer = Scorer::new(&made.bank, way.scoring.clone())?.with_views(&made.views)?;
     let rows = tools.texts(&[text.to_owned()])?;
     let scores = scorer.text(rows.first().map_or(&[], Vec::as_slice))?;
     let rows = u16::try_from(made.bank.len()).unwrap_or(u16::MAX);

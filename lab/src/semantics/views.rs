@@ -18,8 +18,8 @@ use crate::{
         Kinds, Labels, PixelWeights, RenderRequest, Renderer, cpu::CpuRenderer, plan::served,
     },
     scene::{
-        Bank, Camera, Crop, Method, PhotoMasks, PosedPhoto, Scene, SceneOptions, SemanticsReport,
-        Watch,
+        Bank, Camera, Crop, Method, PhotoMasks, PosedPhoto, RowViews, Scene, SceneOptions,
+        SemanticsReport, Watch,
     },
     scenes::{make, scene_of, view_request},
 };
@@ -43,6 +43,7 @@ pub(super) struct Made {
     method: Method,
     pub(super) scene: Scene,
     pub(super) bank: Bank,
+    pub(super) views: RowViews,
     meaning: SemanticsReport,
 }
 
@@ -60,6 +61,7 @@ pub(super) struct Seen {
 /// A bank and the weights of each pixel of the target over it.
 pub(super) struct BankView {
     bank: Bank,
+    views: RowViews,
     weights: PixelWeights,
 }
 
@@ -88,12 +90,19 @@ impl<'a> Tools<'a> {
         let meaning = understand(self.engine, &parts, &method, watch)?;
         let gaussians = reconstruction.gaussians.with_semantic_index(meaning.index)?;
         let scene = scene_of(Reconstruction { gaussians, ..reconstruction });
-        Ok(Made { given, method, scene, bank: meaning.bank, meaning: meaning.report })
+        Ok(Made {
+            given,
+            method,
+            scene,
+            bank: meaning.bank,
+            views: meaning.views,
+            meaning: meaning.report,
+        })
     }
 
     /// Looks at a scene from the target's camera; with `flat` also at its first photo alone.
     pub(super) fn see(&self, made: &Made, target: &PosedPhoto, flat: bool) -> Result<Seen> {
-        let Made { given, method, scene, bank, meaning } = made;
+        let Made { given, method, scene, bank, views, meaning } = made;
         let plain = view_request(target.camera, Kinds::COLOR, scene.meta.report.median_depth);
         let request = RenderRequest { labels: Labels::Weights, ..plain };
         let frame = self.renderer.render(&scene.gaussians, &served(scene, request))?;
@@ -107,7 +116,7 @@ impl<'a> Tools<'a> {
             "coverage": weight / weights.pixels().max(1) as f64,
             "warnings": scene.meta.report.warnings.len(),
         });
-        let mut banks = vec![BankView { bank: bank.clone(), weights }];
+        let mut banks = vec![BankView { bank: bank.clone(), views: views.clone(), weights }];
         if let Some(nearest) = given.first().filter(|_| flat) {
             let cancel = AtomicBool::new(false);
             banks.push(self.flat(nearest, &target.camera, method, &cancel)?);
@@ -162,7 +171,8 @@ impl<'a> Tools<'a> {
                 weights.offsets.push(u32::try_from(weights.entries.len()).unwrap_or(u32::MAX));
             }
         }
-        Ok(BankView { bank: Bank { dim: manifest.dim, rows }, weights })
+        let bank = Bank { dim: manifest.dim, rows };
+        Ok(BankView { bank, views: RowViews::default(), weights })
     }
 }
 
@@ -204,7 +214,7 @@ impl BankView {
     /// At one pixel all texts share the feature's length, so the smallest `E . B(q - c)` over the
     /// phrases orders them as their relevancies do.
     pub(super) fn maps(&self, scoring: &Arc<Scoring>, texts: &[Vec<f32>]) -> Result<Vec<TextMap>> {
-        let scorer = Scorer::new(&self.bank, Arc::clone(scoring))?;
+        let scorer = Scorer::new(&self.bank, Arc::clone(scoring))?.with_views(&self.views)?;
         let of = &self.weights;
         let map = |text: &Vec<f32>| -> Result<TextMap> {
             let scores = scorer.text(text)?;

@@ -1,9 +1,9 @@
 """The ranges of activations that cpu_graph.py computes in 8 bits.
 
-    python calibrate.py --graph geometry.onnx --data SHARED --out ranges.json
+    python calibrate.py --graph geometry.onnx --data SHARED --out ranges.json [--views 2]
 
-Inputs: planes that carry photographs, seen by two cameras, and pairs of the scenes that choose
-constants; never a scene that is reported. A range is the smallest and largest number of all.
+Inputs: planes that carry photographs, seen by two cameras, and sets of photos of the scenes that
+choose constants; never a scene that is reported. A range is the smallest and largest number of all.
 """
 import argparse
 import io
@@ -20,14 +20,18 @@ from PIL import Image
 from cpu_graph import Graph, quantised
 
 SIZES = [(256, 256), (256, 256), (256, 256), (224, 288), (192, 320), (288, 224)]
-CHOOSE = ("computer_mouse", "juice_box_table", "sceaux_castle", "terrace")
+CHOOSE = ("computer_mouse", "juice_box_table", "terrace", "wooden_sculpture", "blowtorch", "milk_carton")
+NEIGHBORS = 3
 
 
 def packed(images, lenses, poses, near, far):
     f32 = lambda a: np.ascontiguousarray(np.array(a, np.float32))
+    n, c = len(images), np.array(poses)[:, :3, 3]
+    apart = np.linalg.norm(c[:, None] - c[None], axis=2) + np.diag(np.full(n, np.inf))
     return {
         "images": f32(images), "intrinsics": f32(lenses), "camera_to_world": f32(poses),
-        "near": np.full(2, near, np.float32), "far": np.full(2, far, np.float32), "neighbors": np.array([[1], [0]]),
+        "near": np.full(n, near, np.float32), "far": np.full(n, far, np.float32),
+        "neighbors": apart.argsort(1)[:, : min(n - 1, NEIGHBORS)],
     }
 
 
@@ -59,14 +63,14 @@ def planes(data, seed):
     return packed(images, [lens, lens], poses, depths[-1] * 0.7, depths[0] * 1.5)
 
 
-def pair(data, scene, first):
-    """Two photos of a scene, one after the other."""
+def photos(data, scene, first, count):
+    """Photos of a scene, one after the other."""
     folder = os.path.join(data, "scenes", scene)
     with open(os.path.join(folder, "transforms.json")) as file:
         top = json.load(file)
     frames = sorted(top["frames"], key=lambda f: f["file_path"])
     images, lenses, poses = [], [], []
-    for frame in (frames[first % len(frames)], frames[(first + 1) % len(frames)]):
+    for frame in (frames[(first + k) % len(frames)] for k in range(count)):
         get = lambda key: frame.get(key, top.get(key, 0)) or 0
         photo = Image.open(os.path.join(folder, frame["file_path"])).convert("RGB")
         side = min(photo.size)
@@ -78,7 +82,8 @@ def pair(data, scene, first):
         pose[:3, 1:3] *= -1
         poses.append(pose)
     poses = [np.linalg.inv(poses[0]) @ p for p in poses]
-    baseline = np.linalg.norm(poses[1][:3, 3])
+    c = np.array(poses)[:, :3, 3]
+    baseline = np.linalg.norm(c[:, None] - c[None], axis=2).max()
     for p in poses:
         p[:3, 3] /= baseline
     return packed(images, lenses, poses, 1.5, 30)
@@ -89,6 +94,7 @@ def main():
     ap.add_argument("--graph", required=True)
     ap.add_argument("--data", required=True)
     ap.add_argument("--out", required=True)
+    ap.add_argument("--views", type=int, default=2, help="photos of a set")
     args = ap.parse_args()
     g = Graph(args.graph)
     names = list(dict.fromkeys(x for n, _ in quantised(g) for x in (n.input[0], n.output[0])))
@@ -96,7 +102,7 @@ def main():
     model.graph.output.extend(helper.make_tensor_value_info(n, TensorProto.FLOAT, None) for n in names)
     session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     inputs = [planes(args.data, seed) for seed in range(14)]
-    inputs += [pair(args.data, scene, 3 * k) for scene in CHOOSE for k in range(3)]
+    inputs += [photos(args.data, scene, 3 * k, args.views) for scene in CHOOSE for k in range(3)]
     ranges = {}
     for each in inputs:
         for name, found in zip(names, session.run(names, each)):

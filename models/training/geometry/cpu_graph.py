@@ -1,6 +1,7 @@
 """geometry.onnx to geometry_cpu.onnx: the same network for CPUs, in about half the time.
 
     python cpu_graph.py geometry.onnx geometry_cpu.onnx ranges.json
+    python cpu_graph.py geometry_many.onnx geometry_many_cpu.onnx ranges_many.json geometry.onnx
 
 - Attention is one operator of ONNX Runtime (`MultiHeadAttention`).
 - The plane sweep's product is one operator of the server (`segsplat:Correlate`,
@@ -9,8 +10,8 @@
 - Convolutions and linear layers compute in 8 bits, but for those next to the outputs (`KEPT`).
   Ranges of activations come from `calibrate.py`; linear layers find theirs at each run.
 
-The file holds no weights: it takes them from geometry.onnx, which lies beside it, at their place in
-that file. So both are always of one export; the manifest's hashes hold them together.
+The file holds no weights: it takes them from the files beside it, at their place there. So they are
+always of one export; the manifest's hashes hold them together.
 """
 import json
 import os
@@ -25,6 +26,12 @@ HEADS = 6
 PRODUCTS = 2
 # Near the outputs 8 bits are seen: colours, the last depths, features that are compared.
 KEPT = ("/head_in/", "/out/", "/up_h/", "/r_out/", "/m2/", "/m4/", "/logits/", "/u4/", "/stem/")
+
+# Operators that weights are stored behind: quantise.py, difference.py.
+STORED_BY = {
+    "Cast": lambda x: x, "Mul": np.multiply, "Add": np.add, "Sub": np.subtract, "Floor": np.floor,
+    "Concat": lambda *parts: np.concatenate(parts),
+}
 
 
 class Graph:
@@ -47,16 +54,14 @@ class Graph:
         return name
 
     def value(self, name):
-        """A constant as f32, through the Cast or DequantizeLinear that it is stored behind."""
+        """A constant as f32, through what it is stored behind; None where it is no constant."""
         if name in self.inits:
             return numpy_helper.to_array(self.inits[name]).astype(np.float32)
         maker = self.makers.get(name)
-        if maker is None or maker.op_type not in ("Cast", "DequantizeLinear") or maker.input[0] not in self.inits:
+        if maker is None or maker.op_type not in STORED_BY:
             return None
-        value = self.value(maker.input[0])
-        if maker.op_type == "DequantizeLinear":
-            value = value * self.value(maker.input[1]).reshape([-1] + [1] * (value.ndim - 1))
-        return value
+        parts = [self.value(part) for part in maker.input]
+        return None if any(part is None for part in parts) else STORED_BY[maker.op_type](*parts)
 
     def user(self, name, op):
         """The first node of type `op` that takes the value; shapes of it are taken, too."""
@@ -67,8 +72,8 @@ class Graph:
             for k, i in enumerate(n.input):
                 n.input[k] = names.get(i, i)
 
-    def finish(self, path, external=None):
-        """Sorts, drops what nothing needs, and writes; large constants stay in `external`."""
+    def finish(self, path, external=()):
+        """Sorts, drops what nothing needs, and writes; large constants stay in the files `external`."""
         have = {i.name for i in self.graph.input} | set(self.inits) | {""}
         order, todo = [], self.nodes
         while todo:
@@ -84,8 +89,8 @@ class Graph:
                 kept.append(n)
                 need |= set(n.input)
         inits = [i for i in self.inits.values() if i.name in need]
-        if external:
-            inits = [outside(i, external) if i.name in self.stored else i for i in inits]
+        for file in external:
+            inits = [outside(i, file) if i.name in self.stored else i for i in inits]
         del self.graph.node[:], self.graph.initializer[:], self.graph.value_info[:]
         self.graph.node.extend(reversed(kept))
         self.graph.initializer.extend(inits)
@@ -102,7 +107,7 @@ def outside(init, path, least=1024):
     with open(path, "rb") as file:
         at = file.read().find(init.raw_data)
     if at < 0:
-        raise SystemExit(f"{init.name} is not in {path}")
+        return init
     there = onnx.TensorProto(name=init.name, data_type=init.data_type, dims=init.dims, data_location=TensorProto.EXTERNAL)
     for key, value in (("location", os.path.basename(path)), ("offset", at), ("length", len(init.raw_data))):
         there.external_data.add(key=key, value=str(value))
@@ -191,6 +196,20 @@ def quantised(g):
             yield n, g.value(n.input[1])
 
 
+def linear(g):
+    """Linear layers that are computed in 8 bits: [(node, weight)]."""
+    for n in g.nodes:
+        value = g.value(n.input[1]) if n.op_type == "MatMul" else None
+        if value is not None and value.ndim == 2 and value.shape[0] >= 96:
+            yield n, value
+
+
+def steps_of(weight, axis):
+    """The step of each channel along an axis in 8 bits, in a shape to multiply by."""
+    others = tuple(k for k in range(weight.ndim) if k != axis)
+    return np.maximum(np.abs(weight).max(others, keepdims=True), 1e-8).astype(np.float32) / np.float32(127)
+
+
 def eight_bits(g, ranges):
     def steps(name):
         low, high = min(ranges[name][0], 0.0), max(ranges[name][1], 0.0)
@@ -204,24 +223,28 @@ def eight_bits(g, ranges):
         g.nodes.append(helper.make_node("QuantizeLinear", [source, s, z], [f"{name}{tag}_q"], f"{name}{tag}_q"))
         return helper.make_node("DequantizeLinear", [f"{name}{tag}_q", s, z], [f"{name}{tag}_d"], f"{name}{tag}_d"), scale
 
-    def weight(name, value, axis):
-        """Steps of a weight along an axis, and the weight in them, both from the f16 of the file."""
-        others = tuple(k for k in range(value.ndim) if k != axis)
-        scale = np.maximum(np.abs(value).max(others), 1e-8).astype(np.float32) / np.float32(127)
-        s = g.constant(name + "_s8", scale)
-        z = g.constant(name + "_z8", np.zeros(scale.size, np.int8))
-        g.nodes.append(helper.make_node("QuantizeLinear", [name, s, z], [name + "_q8"], name + "_q8", axis=axis))
-        return name + "_q8", s, z, scale
+    def weight(name, axis):
+        """The 8 bits of a weight, their steps, zero, and the steps' numbers."""
+        back = g.makers[name]
+        if back.op_type == "Mul":  # as quantise.py stored it
+            bits, scale = g.makers[back.input[0]].input[0], g.value(back.input[1]).ravel()
+        else:  # the sum of difference.py is rounded at load
+            bits, scale = name + "_q8", steps_of(g.value(name), axis).ravel()
+        steps = g.constant(name + "_s8", scale)
+        zero = g.constant(name + "_z8", np.zeros(scale.size, np.int8))
+        if back.op_type != "Mul":
+            g.nodes.append(helper.make_node("QuantizeLinear", [name, steps, zero], [bits], bits, axis=axis))
+        return bits, steps, zero, scale
 
     inputs = {}
-    for n, value in list(quantised(g)):
+    for n, _ in list(quantised(g)):
         x, y, w = n.input[0], n.output[0], n.input[1]
         if x not in inputs:
             back, scale = rounded(x, x, "_in")
             g.nodes.append(back)
             inputs[x] = back.output[0], scale
         source, step = inputs[x]
-        q, s, z, scale = weight(w, value, 0)
+        q, s, z, scale = weight(w, 0)
         g.nodes.append(helper.make_node("DequantizeLinear", [q, s, z], [w + "_d8"], w + "_d8", axis=0))
         bias = g.value(n.input[2])
         b = g.constant(n.input[2] + "_b8", np.round(bias / (scale * step)).astype(np.int32))
@@ -231,21 +254,19 @@ def eight_bits(g, ranges):
         back, _ = rounded(y, y + "_f", "_out")
         back.output[0] = y
         g.nodes.append(back)
-    for n in [n for n in g.nodes if n.op_type == "MatMul"]:
-        value = g.value(n.input[1])
-        if value is not None and value.ndim == 2 and value.shape[0] >= 96:
-            q, s, _, _ = weight(n.input[1], value, 1)
-            g.nodes.remove(n)
-            g.nodes.append(helper.make_node("DynamicQuantizeMatMul", [n.input[0], q, s], list(n.output), n.name, domain="com.microsoft"))
+    for n, _ in list(linear(g)):
+        q, s, _, _ = weight(n.input[1], 1)
+        g.nodes.remove(n)
+        g.nodes.append(helper.make_node("DynamicQuantizeMatMul", [n.input[0], q, s], list(n.output), n.name, domain="com.microsoft"))
 
 
-def main(source, target, ranges):
+def main(source, target, ranges, *others):
     g = Graph(source)
     attention(g)
     sweeps(g)
     with open(ranges) as file:
         eight_bits(g, json.load(file))
-    g.finish(target, source)
+    g.finish(target, (source, *others))
 
 
 if __name__ == "__main__":

@@ -6,13 +6,13 @@ from model import SH_C0
 
 
 BLUR = 0.3  # square pixels that the renderer adds
+FRONT = 4  # photos that are in front in a view
+TURN_COST = 0.5  # of a radian, in steps of a median depth
 OWN_SIZE = 1.25  # up to this magnification a view counts as of the photos' own size
 
 
 def render(out, c2w, K, H, W):
     """Pictures [B,T,3,H,W] of the network's Gaussians from cameras c2w [B,T,4,4], K normalised."""
-    from gsplat import rasterization
-
     B, T = c2w.shape[:2]
     g = world_gaussians(out)
     size = torch.tensor([[W], [H], [1]], device=K.device, dtype=torch.float32)
@@ -20,11 +20,42 @@ def render(out, c2w, K, H, W):
     K = (K * size).flatten(0, 1).contiguous()
     g = {k: v.repeat_interleave(T, 0) for k, v in g.items()}
     g["scales"] = (g["scales"] ** 2 + lost_blur(g["means"], g.pop("width"), views, K)[..., None]).sqrt()
-    img, _, _ = rasterization(
+    front = in_front(out, c2w)
+    if front is None:
+        img = rasterized(g, views, K, W, H)[0]
+    else:  # those in front first, then the others behind them
+        front = front.flatten(0, 1).repeat_interleave(out["means"][0, 0, ..., 0].numel(), 1)
+        img, alpha = rasterized(g | {"opacities": g["opacities"] * front}, views, K, W, H)
+        img = img + (1 - alpha) * rasterized(g | {"opacities": g["opacities"] * ~front}, views, K, W, H)[0]
+    return img.permute(0, 1, 4, 2, 3).reshape(B, T, 3, H, W)
+
+
+def rasterized(g, views, K, W, H):
+    """Colours and alphas [B*T,1,H,W,...] of one layer."""
+    from gsplat import rasterization
+
+    img, alpha, _ = rasterization(
         g["means"], g["quats"], g["scales"], g["opacities"], g["colors"],
         views[:, None], K[:, None], W, H, near_plane=1e-3, packed=False,
     )
-    return img[..., :3].permute(0, 1, 4, 2, 3).reshape(B, T, 3, H, W)
+    return img[..., :3], alpha
+
+
+@torch.no_grad()
+def in_front(out, c2w):
+    """Whether each photo's Gaussians are in front [B,T,V]; None where those of all are.
+
+    As crates/render/src/plan.rs: the photos whose cameras are nearest to the view's, by steps in
+    median depths and by turns.
+    """
+    own = out["c2w"].float()
+    if own.shape[1] <= FRONT:
+        return None
+    depth = out["means"][..., 2].flatten(1).median(1).values[:, None, None]
+    step = torch.cdist(c2w[..., :3, 3], own[..., :3, 3]) / depth
+    turn = torch.einsum("bti,bvi->btv", c2w[..., :3, 2], own[..., :3, 2]).clamp(-1, 1).arccos()
+    cost = step + TURN_COST * turn
+    return cost <= cost.kthvalue(FRONT, -1, keepdim=True).values
 
 
 @torch.no_grad()

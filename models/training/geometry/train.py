@@ -29,9 +29,8 @@ from splats import depth_loss, nearest_views, picture_loss, render
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 SHAPES = [(256, 256)] * 7 + [(224, 288), (288, 224), (192, 320), (320, 192)]
-VIEWS, VIEW_SHARES = [2, 3, 4, 6, 8], [0.5, 0.08, 0.18, 0.09, 0.15]
+VIEWS = ["2:0.5", "3:0.08", "4:0.18", "6:0.09", "8:0.15"]
 ZOOM_SHARE = 0.3
-ROBUST = 0.35
 PART = 15 << 20  # bytes of one file of weights
 
 
@@ -52,6 +51,8 @@ def parse():
     ap.add_argument("--save-every", type=float, default=150)
     ap.add_argument("--steps", type=int, default=10**9)
     ap.add_argument("--seed", type=int, default=1)
+    ap.add_argument("--views", nargs="*", default=VIEWS, help="photos of a set and how often it is drawn, N:SHARE")
+    ap.add_argument("--robust", type=float, help="an error of a real photo far over this counts no more")
     ap.add_argument("--batch", type=int, default=16, help="pairs a step; fewer sets of more views")
     return ap.parse_args()
 
@@ -211,7 +212,8 @@ class Trainer:
         real = self.data.photos is not None and draw.random() < args.real_share
         depth_only = share < args.depth_share and not args.init
         wide = 1.0 if args.init else min(max((share - 0.08) / 0.4, 0.0), 1.0)
-        V = draw.choices(VIEWS, VIEW_SHARES)[0]
+        counts, shares = zip(*(each.split(":") for each in args.views))
+        V = int(draw.choices(counts, [float(share) for share in shares])[0])
         H, W = draw.choice(SHAPES)
         zoom = 2 if draw.random() < ZOOM_SHARE and not depth_only else 1
         B, T = max(args.batch * 2 // V, 1), 2 if zoom == 1 else 1
@@ -232,7 +234,7 @@ class Trainer:
             want = targets.flatten(0, 1)
             if mask is not None:  # where no input looks there is nothing to learn
                 want = torch.where(mask.flatten(0, 1) > 0, want, pic.detach())
-            picture, mse = picture_loss(pic, want, ROBUST if real else None)
+            picture, mse = picture_loss(pic, want, args.robust if real else None)
             loss = 0.25 * loss + picture
         self.update(loss)
         kind = "real" if real else "made"

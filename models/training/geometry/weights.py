@@ -1,14 +1,14 @@
-"""The weights of geometry.onnx back as a state of `GeometryNet`, to go on training from what ships.
+"""The weights of a shipped file back as a state of `GeometryNet`, to go on training from what ships.
 
     python weights.py ../../embedded/geometry.onnx start.pt
+    python weights.py ../../embedded/geometry_many.onnx start_many.pt
 """
 import sys
 
 import numpy as np
-import onnx
 import torch
-from onnx import numpy_helper
 
+from cpu_graph import STORED_BY, Graph
 from model import GeometryNet
 
 
@@ -22,24 +22,13 @@ def module_of(node):
     return ".".join(parts)
 
 
-def values(graph):
-    """All stored numbers by the name that nodes use, with their Cast or 8 bits undone."""
-    found = {t.name: numpy_helper.to_array(t) for t in graph.initializer}
-    for n in graph.node:
-        if n.op_type == "Cast" and n.input[0] in found:
-            found[n.output[0]] = found[n.input[0]].astype(np.float32)
-        elif n.op_type == "DequantizeLinear" and n.input[0] in found:
-            scale = found[n.input[1]]
-            found[n.output[0]] = found[n.input[0]].astype(np.float32) * scale.reshape(-1, 1, 1, 1)
-    return found
-
-
 def state(path):
-    graph = onnx.load(path).graph
-    found = values(graph)
+    g = Graph(path)
+    names = [*g.inits, *(o for n in g.nodes if n.op_type in STORED_BY for o in n.output)]
+    found = {name: value for name in names if (value := g.value(name)) is not None}
     want = GeometryNet().state_dict()
     out = {k: found["net." + k] for k in want if "net." + k in found}
-    for n in graph.node:
+    for n in g.nodes:
         kind = {"MatMul": "weight", "Mul": "weight", "Add": "bias"}.get(n.op_type)
         for name in n.input:
             key = f"{module_of(n)}.{kind}"

@@ -231,8 +231,8 @@ macro_rules! method_fields {
     ($same:ident) => {
         $same! {
             prune, fuse_layers, backdrop, skip_covered, seeds, full_resolution, mask_filters,
-            crop_whole, crop_margin, context, lambda, bank_rows, votes, merge_cosine, front_photos,
-            magnify
+            crop_whole, crop_margin, context, tracks, lambda, bank_rows, votes, merge_cosine,
+            front_photos, magnify
         }
     };
 }

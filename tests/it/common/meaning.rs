@@ -135,8 +135,8 @@ impl SemanticNetworks for PhotoMeaning {
             bank: Bank { dim: DIM, rows },
             index,
             photos: (0..photos).map(map).collect(),
-            masks: Vec::new(),
             report,
+            ..Semantics::default()
         })
     }
 }

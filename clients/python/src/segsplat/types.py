@@ -256,13 +256,16 @@ class SceneOptions(TypedDict, total=False):
     crop_margin: bool
     #: Whether the embedding of a mask is also that of its place in the whole photo.
     context: bool
-    #: Rows of the bank over the mean number of masks of a photo.
+    #: Whether masks of different photos on the same Gaussians share a row of the bank; else K-Means
+    #: makes the rows, with `lambda_`, `bank_rows` and `merge_cosine`.
+    tracks: bool
+    #: Without tracks: rows of the bank over the mean number of masks of a photo.
     lambda_: float
-    #: Rows of the bank (M); 0: by `lambda_`.
+    #: Without tracks: rows of the bank (M); 0: by `lambda_`.
     bank_rows: int
     #: Whether all photos that show a Gaussian vote for its entry.
     votes: bool
-    #: Least cosine of two entries that become one; 0: no two do.
+    #: Without tracks: least cosine of two entries that become one; 0: no two do.
     merge_cosine: float
     #: Photos whose Gaussians are in front in a view; 0: those of all.
     front_photos: int

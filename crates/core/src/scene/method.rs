@@ -182,14 +182,17 @@ method! {
     /// Whether the embedding of a mask is also that of its place in the whole photo, where the
     /// bundle's image tower gives one.
     context: bool = true, false;
-    /// Rows of the bank over the mean number of masks of a photo.
+    /// Whether masks of different photos that lie on the same Gaussians share a row of the bank,
+    /// and a text looks at each of them; else K-Means makes the rows.
+    tracks: bool = true, false;
+    /// Without tracks: rows of the bank over the mean number of masks of a photo.
     lambda: f64 = 1.2, 1.2;
-    /// Rows of the bank (M); 0: by `lambda`.
+    /// Without tracks: rows of the bank (M); 0: by `lambda`.
     bank_rows: u32 = 0, 0;
     /// Whether all photos that show a Gaussian vote for its entry.
     votes: bool = true, false;
-    /// Least cosine of two entries that become one, where two photos show them on one thing; 0: no
-    /// two do.
+    /// Without tracks: least cosine of two entries that become one, where two photos show them on
+    /// one thing; 0: no two do.
     merge_cosine: f64 = 0.7, 0.0;
     /// Photos whose Gaussians are in front in a view, the nearest ones; 0: those of all.
     front_photos: u32 = 4, 0;

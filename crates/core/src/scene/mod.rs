@@ -42,7 +42,7 @@ pub use refinement::{Refine, RefineReport, RefineState, RefineStatus};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{
     Bank, BankMask, DenseFeatures, IndexMap, JudgedMasks, MaskInfo, MaskJudging, MaskLogits,
-    OverlapNms, PhotoMasks, Semantics, SemanticsReport, TextEmbedding,
+    OverlapNms, PhotoMasks, RowViews, Semantics, SemanticsReport, TextEmbedding,
 };
 pub use stage::{Stage, Watch, unless_cancelled};
 pub use status::{Event, SceneCamera, SceneState, SceneStatus, SemanticsState, SemanticsStatus};

@@ -158,6 +158,16 @@ impl Bank {
     }
 }
 
+/// Embeddings of single masks beside the rows of a bank: what a thing looks like from here and
+/// from there. A row alone is the mean of its masks, and a name that fits some is lost there.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RowViews {
+    /// `[V]` entry of each, ascending, from 1.
+    pub entries: Vec<u16>,
+    /// `[V * dim]`, each of length 1; `dim` is that of the bank.
+    pub rows: Vec<f32>,
+}
+
 /// Counts and times of making the semantics.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct SemanticsReport {
@@ -195,6 +205,8 @@ pub struct BankMask {
 pub struct Semantics {
     /// The bank.
     pub bank: Bank,
+    /// Masks that its rows stand for; empty where a row is all that is kept.
+    pub views: RowViews,
     /// `[N]` entry of each Gaussian, in the order of the scene's Gaussians.
     pub index: Vec<u16>,
     /// Index maps of the photos, in their order.

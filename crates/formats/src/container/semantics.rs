@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::{Container, ContainerArray, ContainerKind, write};
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Bank, BankMask, IndexMap, SceneId, Semantics, SemanticsReport},
+    scene::{Bank, BankMask, IndexMap, RowViews, SceneId, Semantics, SemanticsReport},
 };
 
 const LABEL: ContainerKind = ContainerKind { kind: "segsplat-semantics", version: 1 };
@@ -43,12 +43,19 @@ pub fn write_semantics(
     let cells: Vec<u16> = semantics.photos.iter().flat_map(|map| map.index.clone()).collect();
     let masks: Vec<[u32; 3]> =
         semantics.masks.iter().map(|m| [m.photo, m.mask, u32::from(m.entry)]).collect();
-    let arrays = [
+    let (views, seen) = (&semantics.views, semantics.views.entries.len());
+    let mut arrays = vec![
         ContainerArray::new("bank", Dtype::F32, &[bank.len(), bank.dim], &bank.rows),
         ContainerArray::new("index", Dtype::U16, &[semantics.index.len()], &semantics.index),
         ContainerArray::new("photos", Dtype::U16, &[cells.len()], &cells),
         ContainerArray::new("masks", Dtype::U32, &[masks.len(), 3], &masks),
     ];
+    if seen > 0 {
+        arrays.extend([
+            ContainerArray::new("view_entries", Dtype::U16, &[seen], &views.entries),
+            ContainerArray::new("views", Dtype::F32, &[seen, bank.dim], &views.rows),
+        ]);
+    }
     write(to, &LABEL, &header, &arrays)
 }
 
@@ -68,6 +75,22 @@ pub fn read_semantics(file: &[u8], id: &SceneId) -> Result<(Semantics, String)> 
     let bank = Bank { dim: header.dim, rows: container.rows("bank", Dtype::F32)? };
     if bank.rows.len() != bank.len() * bank.dim || bank.rows.iter().any(|v| !v.is_finite()) {
         return Err(corrupt("the bank has no whole number of finite rows".to_owned()));
+    }
+    // Semantics without tracks have none, nor have those of earlier programs.
+    let views = match container.has("views") {
+        true => RowViews {
+            entries: container.rows("view_entries", Dtype::U16)?,
+            rows: container.rows("views", Dtype::F32)?,
+        },
+        false => RowViews::default(),
+    };
+    let known = |m: &u16| (1..=bank.len()).contains(&usize::from(*m));
+    if views.rows.len() != views.entries.len() * bank.dim
+        || views.rows.iter().any(|v| !v.is_finite())
+        || !views.entries.iter().all(known)
+        || !views.entries.is_sorted()
+    {
+        return Err(corrupt("the views are not finite rows of the bank, in its order".to_owned()));
     }
     let mut cells = &container.rows::<u16>("photos", Dtype::U16)?[..];
     let mut photos = Vec::new();
@@ -92,5 +115,5 @@ pub fn read_semantics(file: &[u8], id: &SceneId) -> Result<(Semantics, String)> 
         }
         false => Vec::new(),
     };
-    Ok((Semantics { bank, index, photos, masks, report: header.report }, container.sha256))
+    Ok((Semantics { bank, views, index, photos, masks, report: header.report }, container.sha256))
 }

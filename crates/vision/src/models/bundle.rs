@@ -65,9 +65,10 @@ type Data<'a> = [&'a Option<String>; 2];
 /// A file that the manifest names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BundleFile<'a> {
-    /// What it is for: `geometry`, `geometry.cpu`, `masks.encoder`, `masks.decoder`,
-    /// `image_text.image`, `image_text.text`, `image_text.tokenizer`, `image_text.words`,
-    /// `features`. A file of weights beside another has that one's name.
+    /// What it is for: `geometry`, `geometry.cpu`, `geometry.many`, `geometry.many.cpu`,
+    /// `masks.encoder`, `masks.decoder`, `image_text.image`, `image_text.text`,
+    /// `image_text.tokenizer`, `image_text.words`, `features`. A file of weights beside
+    /// another has that one's name.
     pub part: &'static str,
     /// Name in the bundle's folder.
     pub file: &'a str,
@@ -279,6 +280,13 @@ impl Bundle {
         network("geometry", &*g.licence, [&g.file, &g.sha256], [&g.data, &g.data_sha256]);
         if let Some(cpu) = &g.cpu {
             network("geometry.cpu", &g.licence, [&cpu.file, &cpu.sha256], [&None, &None]);
+        }
+        if let Some(many) = &g.many {
+            network("geometry.many", &g.licence, [&many.file, &many.sha256], [&None, &None]);
+            if let Some(cpu) = &many.cpu {
+                let file = [&*cpu.file, &cpu.sha256];
+                network("geometry.many.cpu", &g.licence, file, [&None, &None]);
+            }
         }
         if let Some(MasksManifest { encoder: e, decoder: d, licence, .. }) = masks {
             network("masks.encoder", licence, [&e.file, &e.sha256], [&e.data, &e.data_sha256]);

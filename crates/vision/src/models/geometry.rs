@@ -1,13 +1,13 @@
 //! The geometry network: it fits the photos, makes the model frame, runs a session and returns to
 //! world units.
 
-use std::{borrow::Cow, collections::BTreeSet, sync::Arc};
+use std::{borrow::Cow, collections::BTreeSet, ops::RangeInclusive, sync::Arc};
 
 use crate::{
     error::{Error, Result},
     models::{
-        Bundle, GeometryManifest, ModelFrame, NetworkOptions, OutputFrame, Provider, Runtime,
-        bucket_for, fit,
+        Bundle, GeometryManifest, GeometryWeights, ModelFrame, NetworkOptions, OutputFrame,
+        Provider, Runtime, bucket_for, fit,
         fit::FittedPhoto,
         network::{Input, Network, Outputs, RunMemory, Side, Signature, Spec, Wanted},
         tensors::Numbers,
@@ -44,6 +44,15 @@ pub struct GeometryInput<'a> {
 #[derive(Debug)]
 pub struct Geometry {
     manifest: GeometryManifest,
+    /// By the views of a set; together they are all that the manifest allows.
+    networks: Vec<ByViews>,
+}
+
+/// A network with the weights for sets of so many views.
+#[derive(Debug)]
+struct ByViews {
+    part: &'static str,
+    views: RangeInclusive<usize>,
     network: Network,
 }
 
@@ -55,19 +64,32 @@ impl Geometry {
     /// `model_unavailable` when the provider asked for is not there or differs from the CPU, or the
     /// model does not load.
     pub fn open(runtime: &Arc<Runtime>, bundle: &Bundle, options: &NetworkOptions) -> Result<Self> {
-        let manifest = bundle.geometry().clone();
-        let probe = Tensors::probe(&manifest, manifest.buckets[0], manifest.views_min.max(2));
-        let spec = Spec {
-            what: WHAT,
-            file: &manifest.file,
-            cpu_file: manifest.cpu.as_ref().map(|cpu| cpu.file.as_str()),
-            signature: signature(&manifest),
-            memory: RunMemory::GivenBack,
-            tolerance: TOLERANCE,
-            probe: &|_| Ok(probe.inputs(&manifest)),
+        let manifest = bundle.geometry();
+        let open = |weights: GeometryWeights<'_>| {
+            let probe = Tensors::probe(manifest, manifest.buckets[0], *weights.views.start());
+            let spec = Spec {
+                what: WHAT,
+                file: weights.file,
+                cpu_file: weights.cpu_file,
+                signature: signature(manifest, *weights.views.start()),
+                memory: RunMemory::GivenBack,
+                tolerance: TOLERANCE,
+                probe: &|_| Ok(probe.inputs(manifest)),
+            };
+            let network = Network::open(runtime, bundle, options, &spec)?;
+            Ok(ByViews { part: weights.part, views: weights.views, network })
         };
-        let network = Network::open(runtime, bundle, options, &spec)?;
-        Ok(Self { network, manifest: manifest.clone() })
+        let networks = manifest.weights().into_iter().map(open).collect::<Result<_>>()?;
+        Ok(Self { networks, manifest: manifest.clone() })
+    }
+
+    /// The network for sets of so many views.
+    fn network_for(&self, views: usize) -> Result<&Network> {
+        let found = self.networks.iter().find(|network| network.views.contains(&views));
+        found.map(|found| &found.network).ok_or_else(|| {
+            let GeometryManifest { views_min, views_max, .. } = self.manifest;
+            Error::internal(format!("{WHAT}: {views} views, outside {views_min} to {views_max}"))
+        })
     }
 
     /// Runs every size with the usual numbers of views, where a device computes it: the first run
@@ -80,30 +102,32 @@ impl Geometry {
             return Ok(());
         }
         let manifest = &self.manifest;
-        let range = manifest.views_min..=manifest.views_max;
-        let counts = WARM_VIEWS.into_iter().filter(|views| range.contains(views));
-        for views in counts {
+        for views in WARM_VIEWS {
+            let Ok(network) = self.network_for(views) else { continue };
             for &bucket in &manifest.buckets {
                 let probe = Tensors::probe(manifest, bucket, views);
-                self.network.run(&probe.inputs(manifest), |_| Ok(()))?;
+                network.run(&probe.inputs(manifest), |_| Ok(()))?;
             }
         }
         Ok(())
     }
 
-    /// Runs every size with the fewest and with the most views, and looks at all numbers.
+    /// Runs every size with the fewest and with the most views of each network, and looks at all
+    /// numbers.
     ///
     /// # Errors
     /// `internal` when a run fails, or an output has another shape than the manifest says or holds
     /// a number that is not finite.
     pub(super) fn try_out(&self) -> Result<()> {
         let manifest = &self.manifest;
-        for views in BTreeSet::from([manifest.views_min.max(2), manifest.views_max]) {
-            for &bucket in &manifest.buckets {
-                let probe = Tensors::probe(manifest, bucket, views);
-                self.network.run(&probe.inputs(manifest), |outputs| {
-                    Answer::read(manifest, bucket, views, outputs)?.finite()
-                })?;
+        for ByViews { views, network, .. } in &self.networks {
+            for views in BTreeSet::from([*views.start(), *views.end()]) {
+                for &bucket in &manifest.buckets {
+                    let probe = Tensors::probe(manifest, bucket, views);
+                    network.run(&probe.inputs(manifest), |outputs| {
+                        Answer::read(manifest, bucket, views, outputs)?.finite()
+                    })?;
+                }
             }
         }
         Ok(())
@@ -115,22 +139,24 @@ impl Geometry {
         &self.manifest
     }
 
-    /// The network itself.
+    /// The network of this part of the bundle; `None` where it has none.
     #[must_use]
-    pub fn network(&self) -> &Network {
-        &self.network
+    pub fn network(&self, part: &str) -> Option<&Network> {
+        self.networks.iter().find(|found| found.part == part).map(|found| &found.network)
     }
 
-    /// What computes it.
+    /// What computes it: the CPU where any of its networks is computed there.
     #[must_use]
     pub fn provider(&self) -> Provider {
-        self.network.provider()
+        let mut providers = self.networks.iter().map(|found| found.network.provider());
+        let first = providers.next().unwrap_or(Provider::Cpu);
+        if providers.all(|provider| provider == first) { first } else { Provider::Cpu }
     }
 
     /// Why it is not computed where it was to be; `None` where it is.
     #[must_use]
     pub fn remark(&self) -> Option<String> {
-        self.network.remark()
+        self.networks.iter().find_map(|found| found.network.remark())
     }
 
     /// A Gaussian for each pixel of each view of the set, in world units.
@@ -139,9 +165,10 @@ impl Geometry {
     /// `invalid_request` when all cameras stand at one place; `internal` when the set does not fit
     /// the network, or the network fails or answers with other shapes than its manifest says.
     pub fn run(&self, input: &GeometryInput<'_>) -> Result<Vec<ViewGaussians>> {
+        let network = self.network_for(input.views.len())?;
         let prepared = self.prepare(input)?;
         let inputs = prepared.tensors.inputs(&self.manifest);
-        self.network.run(&inputs, |outputs| self.views(input, &prepared, outputs))
+        network.run(&inputs, |outputs| self.views(input, &prepared, outputs))
     }
 
     /// The outputs of a run, view by view.
@@ -186,12 +213,6 @@ impl Geometry {
 
     fn prepare(&self, input: &GeometryInput<'_>) -> Result<Prepared> {
         let (count, manifest) = (input.views.len(), &self.manifest);
-        if count < manifest.views_min || count > manifest.views_max {
-            return Err(Error::internal(format!(
-                "{WHAT}: {count} views, outside {} to {}",
-                manifest.views_min, manifest.views_max
-            )));
-        }
         let each = input.neighbors.first().map_or(0, Vec::len);
         let fits = |row: &Vec<usize>| row.len() == each && row.iter().all(|&n| n < count);
         if input.neighbors.len() != count
@@ -323,15 +344,19 @@ fn sh_count(manifest: &GeometryManifest) -> usize {
 
 /// Each file with its tensors.
 pub(super) fn signatures(manifest: &GeometryManifest) -> Vec<Signature<'_>> {
-    let cpu = manifest.cpu.iter().map(|cpu| &cpu.file);
-    let files = [&manifest.file].into_iter().chain(cpu);
-    files.map(|file| (WHAT, &**file, signature(manifest))).collect()
+    let mut all = Vec::new();
+    for GeometryWeights { file, cpu_file, views, .. } in manifest.weights() {
+        let files = [Some(file), cpu_file].into_iter().flatten();
+        all.extend(files.map(|file| (WHAT, file, signature(manifest, *views.start()))));
+    }
+    all
 }
 
-/// The tensors of the manifest.
-fn signature(manifest: &GeometryManifest) -> Vec<Wanted<'_>> {
+/// The tensors of the manifest, for so many views and more: a caller of the network itself may give
+/// one with weights for few views as many as the manifest allows.
+fn signature(manifest: &GeometryManifest, least: usize) -> Vec<Wanted<'_>> {
     let (inputs, outputs) = (&manifest.inputs, &manifest.outputs);
-    let views: Vec<usize> = (manifest.views_min.max(2)..=manifest.views_max).collect();
+    let views: Vec<usize> = (least..=manifest.views_max).collect();
     let side = |axis: usize| manifest.buckets.iter().map(|b| b[axis] as usize).collect::<Vec<_>>();
     let of = |side, name, tail: &[&[usize]]| {
         let shape = [&[&*views], tail].concat().into_iter().map(<[usize]>::to_vec).collect();

@@ -119,6 +119,8 @@ pub struct GeometryManifest {
     /// The same network as the CPU runs it, where that is another file: 8-bit arithmetic, and
     /// operators of this program. It may take weights from the network's main file.
     pub cpu: Option<PlainFile>,
+    /// The same network with other weights, for sets of more views.
+    pub many: Option<ManyViews>,
     /// Licence of the weights.
     pub licence: String,
     /// Where the weights come from.
@@ -162,12 +164,68 @@ pub struct PlainFile {
     pub sha256: String,
 }
 
+/// Weights of a geometry network for sets of many views. Their file may take weights from the
+/// network's main file.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ManyViews {
+    /// Fewest views of a set that they are for.
+    pub views_min: usize,
+    /// File in the bundle's folder.
+    pub file: String,
+    /// Its sha256, hex.
+    pub sha256: String,
+    /// The same as the CPU runs it, where that is another file.
+    pub cpu: Option<PlainFile>,
+}
+
+/// A geometry network's weights, and the sets that they are for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct GeometryWeights<'a> {
+    /// The section that names them.
+    pub part: &'static str,
+    /// File in the bundle's folder.
+    pub file: &'a str,
+    /// The file that the CPU runs, where it is another one.
+    pub cpu_file: Option<&'a str>,
+    /// Views of a set.
+    pub views: RangeInclusive<usize>,
+}
+
 impl GeometryManifest {
+    /// All weights, by the views that they are for.
+    #[must_use]
+    pub fn weights(&self) -> Vec<GeometryWeights<'_>> {
+        let least = self.views_min.max(2);
+        let most = self.many.as_ref().map_or(self.views_max, |many| many.views_min - 1);
+        let few = GeometryWeights {
+            part: "geometry",
+            file: &self.file,
+            cpu_file: self.cpu.as_ref().map(|cpu| &*cpu.file),
+            views: least..=most,
+        };
+        let many = self.many.as_ref().map(|many| GeometryWeights {
+            part: "geometry.many",
+            file: &many.file,
+            cpu_file: many.cpu.as_ref().map(|cpu| &*cpu.file),
+            views: many.views_min..=self.views_max,
+        });
+        [Some(few), many].into_iter().flatten().collect()
+    }
+
     pub(super) fn validate(&self, faults: &mut Faults) {
         faults.file("geometry", &self.file, &self.sha256);
         faults.data("geometry", &self.data, &self.data_sha256);
         if let Some(cpu) = &self.cpu {
             faults.file("geometry.cpu", &cpu.file, &cpu.sha256);
+        }
+        if let Some(many) = &self.many {
+            faults.file("geometry.many", &many.file, &many.sha256);
+            if let Some(cpu) = &many.cpu {
+                faults.file("geometry.many.cpu", &cpu.file, &cpu.sha256);
+            }
+            let larger = self.views_min.max(2) + 1..=self.views_max;
+            faults.range("geometry.many.views_min", many.views_min, larger);
         }
         let bad = |side: &u32| !(1..=BUCKET_SIDE_MAX).contains(side);
         if self.buckets.is_empty() || self.buckets.iter().flatten().any(bad) {

@@ -33,9 +33,9 @@ pub use frame::ModelFrame;
 pub use geometry::{Geometry, GeometryInput};
 pub use image_text::{ImageText, PreparedCrops};
 pub use manifest::{
-    DenseManifest, FeaturesManifest, GeometryManifest, ImageTextManifest, ImageTowerManifest,
-    MaskAdapter, MaskDecoderManifest, MaskEncoderManifest, MasksManifest, OutputFrame, PlainFile,
-    TextTowerManifest, Translation,
+    DenseManifest, FeaturesManifest, GeometryManifest, GeometryWeights, ImageTextManifest,
+    ImageTowerManifest, MaskAdapter, MaskDecoderManifest, MaskEncoderManifest, MasksManifest,
+    OutputFrame, PlainFile, TextTowerManifest, Translation,
 };
 pub use masks::{MaskNetwork, PhotoEmbedding};
 pub use network::Network;

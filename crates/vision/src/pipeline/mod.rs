@@ -40,12 +40,18 @@ use crate::{
     },
 };
 
-/// Parts of a bundle that are networks of their own and that callers may run.
-pub const NETWORKS: [&str; 5] =
-    ["geometry", "masks.encoder", "masks.decoder", "image_text.image", "image_text.text"];
+/// Parts of a bundle that are networks of their own, where it has them, and that callers may run.
+pub const NETWORKS: [&str; 6] = [
+    "geometry",
+    "geometry.many",
+    "masks.encoder",
+    "masks.decoder",
+    "image_text.image",
+    "image_text.text",
+];
 
 /// Views that go through the geometry network together, where none are asked for: memory grows with
-/// them, and scenes get no better in the mean (docs/adr/0034-many-photos.md).
+/// them, and scenes of many sets get no better in the mean (docs/adr/0034-many-photos.md).
 const VIEWS_A_RUN: usize = 4;
 
 /// Library, bundle, networks and threads that make scenes. All jobs share one.
@@ -124,12 +130,14 @@ impl Pipeline {
         work: impl FnOnce(&Network) -> Result<T>,
     ) -> Result<T> {
         match part {
-            "geometry" => work(self.geometry.network()),
             "masks.encoder" => work(self.masks()?.encoder()),
             "masks.decoder" => work(self.masks()?.decoder()),
             "image_text.image" => work(self.image_text()?.image_tower()),
             "image_text.text" => work(self.image_text()?.text_tower()),
-            _ => Err(Error::new(ErrorCode::NotFound, "no network of this name")),
+            _ => match self.geometry.network(part) {
+                Some(network) => work(network),
+                None => Err(Error::new(ErrorCode::NotFound, "no network of this name")),
+            },
         }
     }
 
@@ -334,7 +342,9 @@ fn see(
     let Watch { progress, cancel } = watch;
     let mut stages = Stages::new(watch);
     let manifest = pipeline.geometry.manifest();
-    let views_max = views_max(options, manifest.views_min, manifest.views_max)?;
+    let range = [manifest.views_min.max(2), manifest.views_max];
+    let one_set = manifest.many.is_some() && photos.len() <= manifest.views_max;
+    let views_max = views_max(options.max_views, range, one_set)?;
     let method = options.method();
     method.check()?;
     if photos.len() < manifest.views_min {
@@ -465,14 +475,15 @@ impl<'a> Stages<'a> {
     }
 }
 
-/// Views the network takes at once: the caller's wish, within what the network can.
-fn views_max(options: &SceneOptions, least: usize, most: usize) -> Result<usize> {
-    match options.max_views {
+/// Views the network takes at once: the caller's wish, within what the network can. Where there is
+/// none, a scene may be `one_set` if the network has weights for as many views as it has photos.
+fn views_max(wish: Option<usize>, [least, most]: [usize; 2], one_set: bool) -> Result<usize> {
+    match wish {
+        None if one_set => Ok(most),
         None => Ok(most.min(VIEWS_A_RUN.max(least))),
-        Some(wish) if (least.max(2)..=most).contains(&wish) => Ok(wish),
+        Some(wish) if (least..=most).contains(&wish) => Ok(wish),
         Some(wish) => Err(Error::invalid(format!(
-            "max_views is {wish}; this network takes {} to {most} views at once",
-            least.max(2)
+            "max_views is {wish}; this network takes {least} to {most} views at once"
         ))),
     }
 }
@@ -514,4 +525,20 @@ fn mean_best_overlap(capture: &Capture) -> f64 {
     });
     let all: Vec<f64> = best.collect();
     if all.is_empty() { 0.0 } else { all.iter().sum::<f64>() / all.len() as f64 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::views_max;
+
+    #[test]
+    fn views_at_once_are_a_wish_or_the_whole_scene_or_four() {
+        let of = |wish, range, one_set| views_max(wish, range, one_set).ok();
+        assert_eq!(of(None, [2, 8], false), Some(4));
+        assert_eq!(of(None, [2, 8], true), Some(8));
+        assert_eq!(of(None, [2, 3], false), Some(3));
+        assert_eq!(of(None, [6, 6], false), Some(6));
+        assert_eq!(of(Some(5), [2, 8], true), Some(5));
+        assert_eq!((of(Some(1), [2, 8], false), of(Some(9), [2, 8], true)), (None, None));
+    }
 }

@@ -1,7 +1,7 @@
-//! A whole refinement: first without the photos that are held out, which says whether it helps, then
-//! with all, and again with more steps as long as these help. And what it needs of the other stages:
-//! photos at the size at which they are learnt, the scene of the photos that are not held out, and
-//! semantics that follow other Gaussians.
+//! A whole refinement: first without the photos that are held out, which says whether it helps,
+//! then with all, and again with more steps as long as these help. And what it needs of the other
+//! stages: photos at the size at which they are learnt, the scene of the photos that are not held
+//! out, and semantics that follow other Gaussians.
 
 use std::{
     sync::mpsc::{RecvTimeoutError, channel},
@@ -54,12 +54,14 @@ pub struct Refined {
     pub versions: u32,
 }
 
+/// What the networks make of photos but those of some numbers: [`super::make_for_refinement`].
+pub type Remake<'a> = &'a mut dyn FnMut(&[usize]) -> Result<(Reconstruction, Gaussians)>;
+
 /// What a refinement asks of its caller. An error ends it.
 #[expect(missing_debug_implementations, reason = "functions have none")]
 pub struct RefineCalls<'a> {
-    /// The scene without the photos of these numbers, and the same as one set:
-    /// [`super::make_for_refinement`]. The last call is that of all photos.
-    pub remake: &'a mut dyn FnMut(&[usize]) -> Result<(Reconstruction, Gaussians)>,
+    /// The scene without some photos, and the same as one set. The last call is that of all photos.
+    pub remake: Remake<'a>,
     /// Gets the share of the budget that is spent, 0..1, before each step, and may wait.
     pub pace: &'a mut dyn FnMut(f32) -> Result<()>,
     /// Gets each version that is better than the one before, with the scene that it began with.
@@ -161,7 +163,10 @@ impl Parts<'_, '_> {
             };
             if !gains {
                 // Too few steps may not have been enough; more that gain nothing are too many.
-                if whole.is_some() { break } else { continue }
+                if whole.is_some() || proven.steps == 0 {
+                    break;
+                }
+                continue;
             }
             last = proven.judged;
             let (start, gaussians, steps) = match whole.take() {

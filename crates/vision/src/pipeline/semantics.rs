@@ -15,14 +15,16 @@ use crate::{
     models::{ImageText, MaskNetwork},
     scene::{
         Bank, BankMask, Crop, CropShape, DenseFeatures, Gaussians, IndexMap, Method, Photo,
-        PhotoMasks, PosedPhoto, Preset, SceneCamera, ScoringMethod, Semantics, SemanticsReport,
-        Stage, Watch, unless_cancelled,
+        PhotoMasks, PosedPhoto, Preset, RowViews, SceneCamera, ScoringMethod, Semantics,
+        SemanticsReport, Stage, Watch, unless_cancelled,
     },
-    semantics::{self, Clusters, Cutter, Scoring, Views},
+    semantics::{self, Clusters, Cutter, Scoring, Tracks, Views},
 };
 
 /// Crops that take an image tower as long as a whole photo, about.
 const CROPS_A_PHOTO: usize = 5;
+/// Masks of a row that are kept beside it. Half of them name a thing, so more say little.
+const VIEWS_MAX: usize = 16;
 
 /// Gives the masks of each photo. Its argument takes the fraction that is done, 0..1.
 pub type MasksOfPhotos<'a> = dyn Fn(&(dyn Fn(f32) + Sync)) -> Result<Vec<PhotoMasks>> + Sync + 'a;
@@ -170,7 +172,11 @@ pub fn label_photos(
     };
     // Not on a thread of the pool: one that waits for a network would be missing there, and one
     // that waits for its own tasks might begin another job.
-    let mut labelled = label_photos_with(&tools, photos, method, watch)?;
+    let mut labelled = std::thread::scope(|scope| {
+        // What the first text is compared with, meanwhile; a failure is told to the text.
+        (method.preset == Preset::Default).then(|| scope.spawn(|| towers.rivals()));
+        label_photos_with(&tools, photos, method, watch)
+    })?;
     labelled.report.bundle_sha256 = pipeline.bundle.sha256().to_owned();
     labelled.report.execution_provider = towers.provider().name().to_owned();
     Ok(labelled)
@@ -223,27 +229,34 @@ fn label_photos_with<P: Send>(
         }
         Ok(found)
     })?;
-    let labels = stages.run(Stage::Bank, || {
-        let wanted = match method.bank_rows as usize {
-            0 => semantics::rows_wanted(embedded.of.len(), photos.len(), method.lambda),
-            rows => rows,
-        };
-        let clusters = semantics::bank(&embedded.rows, tools.dim, wanted)?;
-        Ok(label(&masks, &embedded.of, clusters))
-    })?;
+    let clusters = match method.tracks {
+        true => None,
+        false => Some(stages.run(Stage::Bank, || {
+            let wanted = match method.bank_rows as usize {
+                0 => semantics::rows_wanted(embedded.of.len(), photos.len(), method.lambda),
+                rows => rows,
+            };
+            semantics::bank(&embedded.rows, tools.dim, wanted)
+        })?),
+    };
     let report = SemanticsReport {
         masks: masks.iter().map(|of| count(of.masks.len())).collect(),
         method: method.clone(),
         stages: stages.times,
         ..SemanticsReport::default()
     };
-    Ok(LabelledPhotos { labels, report })
+    Ok(LabelledPhotos { masks, embedded, dim: tools.dim, clusters, report })
 }
 
-/// The meaning of a scene's photos: the bank, and the entry of each of their pixels.
+/// The meaning of a scene's photos: their masks and what each one looks like.
 #[derive(Debug)]
 pub struct LabelledPhotos {
-    labels: Labels,
+    masks: Vec<PhotoMasks>,
+    embedded: Embedded,
+    /// Numbers of an embedding.
+    dim: usize,
+    /// The bank, where it needs no scene.
+    clusters: Option<Clusters>,
     /// Of the stages so far.
     report: SemanticsReport,
 }
@@ -260,14 +273,34 @@ impl LabelledPhotos {
         watch: Watch<'_>,
     ) -> Result<Semantics> {
         check_input(input)?;
-        let Self { mut labels, mut report } = self;
+        let Self { masks, embedded, dim, clusters, mut report } = self;
         let mut stages = Stages::new(watch);
         let method = &report.method;
-        let index = stages.run(Stage::Assign, || Ok(assign(&mut labels, input, method)))?;
-        report.bank_size = count(labels.bank.len());
+        let (gaussians, cameras) = (input.gaussians, input.cameras);
+        let (labels, index) = match clusters {
+            Some(clusters) => {
+                let mut labels = label(&masks, &embedded.of, clusters);
+                let index = stages.run(Stage::Assign, || Ok(assign(&mut labels, input, method)))?;
+                (labels, index)
+            }
+            None => {
+                let views = Views::new(gaussians, cameras);
+                let labels = stages.run(Stage::Bank, || {
+                    let tracks = semantics::tracks(&views, cameras, &masks, &embedded.of);
+                    Ok(label_tracks(&masks, &embedded, dim, &tracks))
+                })?;
+                let index = stages.run(Stage::Assign, || {
+                    let own = semantics::from_source(gaussians.source(), cameras, &labels.maps);
+                    Ok(if method.votes { views.vote(&own, &labels.maps) } else { own })
+                })?;
+                (labels, index)
+            }
+        };
+        let Labels { bank, views, maps, masks } = labels;
+        report.bank_size = count(bank.len());
         report.labelled = index.iter().filter(|m| **m > 0).count() as u64;
         report.stages.extend(stages.times);
-        Ok(Semantics { bank: labels.bank, index, photos: labels.maps, masks: labels.masks, report })
+        Ok(Semantics { bank, views, index, photos: maps, masks, report })
     }
 }
 
@@ -384,6 +417,7 @@ fn add_contexts(
 #[derive(Debug)]
 struct Labels {
     bank: Bank,
+    views: RowViews,
     maps: Vec<IndexMap>,
     masks: Vec<BankMask>,
 }
@@ -408,7 +442,33 @@ fn label(masks: &[PhotoMasks], of: &[[usize; 2]], clusters: Clusters) -> Labels 
         entries.iter().enumerate().map(|(k, entry)| mask(photo, k, *entry)).collect()
     };
     let masks = becomes.iter().enumerate().flat_map(of_photo).collect();
-    Labels { bank: clusters.bank, maps, masks }
+    Labels { bank: clusters.bank, views: RowViews::default(), maps, masks }
+}
+
+/// The same for tracks: a row is the mean of its masks, and the largest of them are kept beside it,
+/// where it is a part of the scene.
+fn label_tracks(masks: &[PhotoMasks], embedded: &Embedded, dim: usize, tracks: &Tracks) -> Labels {
+    let row = |i: usize| &embedded.rows[i * dim..(i + 1) * dim];
+    let area = |i: usize| {
+        let [photo, mask] = embedded.of[i];
+        masks[photo].masks[mask].area
+    };
+    let (mut rows, mut views) = (Vec::new(), RowViews::default());
+    for (entry, members) in (1..).zip(tracks.rows()) {
+        rows.extend(semantics::mean_row(members.iter().map(|&i| row(i)), dim));
+        if usize::from(entry) > tracks.on_gaussians() {
+            continue;
+        }
+        let mut largest = members.clone();
+        largest.sort_by(|&a, &b| area(b).total_cmp(&area(a)));
+        for &i in largest.iter().take(VIEWS_MAX) {
+            views.entries.push(entry);
+            views.rows.extend(row(i));
+        }
+    }
+    let clusters =
+        Clusters { bank: Bank { dim, rows }, entries: tracks.entries(embedded.of.len()) };
+    Labels { views, ..label(masks, &embedded.of, clusters) }
 }
 
 /// `[N]` entry of each Gaussian. With a `merge_cosine`, entries of one object are joined first.

@@ -1,5 +1,5 @@
-//! From masks and embeddings to meaning: crops, the bank, an entry for each Gaussian, scores of a
-//! text.
+//! From masks and embeddings to meaning: crops, tracks, the bank, an entry for each Gaussian,
+//! scores of a text.
 //!
 //! In: photos, their masks and one embedding for each mask. Out: a
 //! [`Bank`](segsplat_core::scene::Bank) of few rows, the entry of each Gaussian, and for a text
@@ -17,6 +17,7 @@ mod instances;
 mod palette;
 mod rows;
 mod score;
+mod tracks;
 mod views;
 
 pub use self::{
@@ -26,6 +27,8 @@ pub use self::{
     crops::Cutter,
     instances::{Box3, Components, Instance, InstanceOptions},
     palette::{colour, palette_table},
+    rows::mean_row,
     score::{Scorer, Scoring, TextScores, ViewNorms},
+    tracks::{Tracks, tracks},
     views::{Views, merge},
 };

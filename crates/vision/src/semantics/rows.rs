@@ -49,3 +49,15 @@ pub(super) fn unit_rows(bank: &Bank) -> Vec<f32> {
     }
     rows
 }
+
+/// Mean of rows of `dim` numbers, summed in their order; zeros where there are none.
+#[must_use]
+pub fn mean_row<'a>(rows: impl Iterator<Item = &'a [f32]>, dim: usize) -> Vec<f32> {
+    let (mut sums, mut count) = (vec![0.0_f64; dim], 0.0_f64);
+    for row in rows {
+        count += 1.0;
+        sums.iter_mut().zip(row).for_each(|(sum, v)| *sum += f64::from(*v));
+    }
+    #[expect(clippy::cast_possible_truncation, reason = "rows are f32")]
+    sums.into_iter().map(|sum| (sum / count.max(1.0)) as f32).collect()
+}

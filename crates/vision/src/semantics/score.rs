@@ -4,15 +4,21 @@
 //! `cos(F, q) - cos(F, c) = (E . B(q - c)) / sqrt(E^T B B^T E)`. So a text becomes one number for
 //! each row and phrase, `d_c = B(q - c)`. A mask is the sign of a blend of these numbers, for any
 //! size of the bank. Only a relevancy needs the norm, and the norm does not depend on the text.
+//!
+//! A row of tracks stands for masks of several photos ([`RowViews`]). There the number of a row is
+//! the mean over the half of its masks that the text fits best, and over rows that look alike.
 
-use std::sync::{Arc, OnceLock};
+use std::{
+    ops::Range,
+    sync::{Arc, OnceLock},
+};
 
 use rayon::prelude::*;
 
 use super::rows::{dot, norm, unit_rows};
 use crate::{
     error::{Error, Result},
-    scene::{Bank, PixelWeights, ScoringMethod},
+    scene::{Bank, PixelWeights, RowViews, ScoringMethod},
 };
 
 /// Phrases in one blend of four numbers; the fourth number is the coverage.
@@ -20,6 +26,9 @@ const GROUP: usize = 3;
 /// Difference of cosines of an entry that fits a text much less than the best one does: under the
 /// canon, as entries of other things are.
 const LEFT_OUT: f64 = -0.05;
+/// Rows with this cosine look alike: two photographs of things of one name have 0.5 (median), two
+/// things of one photograph 0.35. docs/adr/0074-tracks.md
+const ALIKE: f64 = 0.65;
 /// Pixels of a task.
 const PIXELS_EACH: usize = 4096;
 
@@ -234,6 +243,8 @@ pub struct Scorer {
     norms: Arc<[f64]>,
     /// What a text is compared with, by row: see [`phrases`].
     phrases: Vec<Vec<f64>>,
+    /// The masks that rows stand for; `None`: the rows are all there is.
+    views: Option<Views>,
     /// Lower triangle of B B^T, row by row. The first call of [`Self::norms`] computes it.
     gram: OnceLock<Vec<f64>>,
 }
@@ -255,7 +266,26 @@ impl Scorer {
         let bank = Bank { dim, rows };
         let norms: Arc<[f64]> = bank.rows.chunks_exact(dim).map(norm).collect();
         let phrases = phrases(&bank, &norms, &scoring);
-        Ok(Self { bank, scoring, norms, phrases, gram: OnceLock::new() })
+        Ok(Self { bank, scoring, norms, phrases, views: None, gram: OnceLock::new() })
+    }
+
+    /// The same, where a row stands for masks of several photos.
+    ///
+    /// # Errors
+    /// `internal` when the views are not of this bank.
+    pub fn with_views(mut self, views: &RowViews) -> Result<Self> {
+        let rows = 1..=self.rows();
+        if views.rows.len() != views.entries.len() * self.bank.dim
+            || !views.entries.iter().all(|m| rows.contains(&usize::from(*m)))
+        {
+            return Err(Error::internal("scoring: the views are not of this bank"));
+        }
+        if !views.entries.is_empty() {
+            self.views = Some(Views::new(views, &self.bank, &self.scoring));
+            // The views are compared already.
+            self.phrases = vec![vec![0.0; self.rows()]];
+        }
+        Ok(self)
     }
 
     /// How it scores.
@@ -288,7 +318,15 @@ impl Scorer {
                 self.bank.dim
             )));
         }
-        let own = scores(&self.bank, embedding);
+        let own = match &self.views {
+            Some(views) => views
+                .leads(embedding)
+                .iter()
+                .zip(&*self.norms)
+                .map(|(lead, norm)| lead * norm)
+                .collect(),
+            None => scores(&self.bank, embedding),
+        };
         let group = |canon: &[Vec<f64>]| -> Vec<[f64; 4]> {
             let row = |m: usize| {
                 let [a, b, c] = [0, 1, 2].map(|g| own[m] - canon.get(g).unwrap_or(&canon[0])[m]);
@@ -313,7 +351,10 @@ impl Scorer {
         });
         let mut leads: Vec<f64> = leads.collect();
         // docs/adr/0062-near-the-best-entry.md
-        let best = leads.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let of_scene = |row: usize| self.views.as_ref().is_none_or(|of| !of.of_row[row].is_empty());
+        let best =
+            leads.iter().enumerate().filter(|(row, _)| of_scene(*row)).map(|(_, lead)| *lead);
+        let best = best.fold(f64::NEG_INFINITY, f64::max);
         for (row, lead) in leads.iter_mut().enumerate() {
             if *lead >= 0.0 && *lead < best - self.scoring.near_best {
                 *lead = LEFT_OUT;
@@ -427,6 +468,74 @@ impl Scorer {
             coverage >= self.scoring.coverage_floor && selected(least, most)
         };
         Ok((0..weights.pixels()).into_par_iter().with_min_len(PIXELS_EACH).map(inside).collect())
+    }
+}
+
+/// The masks that the rows of a bank stand for.
+#[derive(Debug)]
+struct Views {
+    /// `[V]`, each of length 1.
+    bank: Bank,
+    /// `[M]` the rows, each of length 1.
+    unit: Bank,
+    /// `[V]` what a text must reach at each: see [`phrases`].
+    bars: Vec<f64>,
+    /// `[M]` which of them are of each row; none of a row that is no part of the scene.
+    of_row: Vec<Range<usize>>,
+    /// `[M]` what a text must reach where a row has none.
+    row_bars: Vec<f64>,
+    /// `[M]` the rows of the scene that look like each one, and how much each counts.
+    alike: Vec<Vec<(usize, f64)>>,
+}
+
+impl Views {
+    fn new(views: &RowViews, rows: &Bank, scoring: &Scoring) -> Self {
+        let bank = Bank { dim: rows.dim, rows: views.rows.clone() };
+        let unit = Bank { dim: rows.dim, rows: unit_rows(rows) };
+        let bars = |of: &Bank| -> Vec<f64> {
+            let phrases = phrases(of, &vec![1.0; of.len()], scoring);
+            let bar = |m: usize| phrases.iter().map(|all| all[m]).fold(f64::NEG_INFINITY, f64::max);
+            (0..of.len()).map(bar).collect()
+        };
+        let place = |entry: usize| views.entries.partition_point(|m| usize::from(*m) < entry);
+        let of_row: Vec<Range<usize>> =
+            (1..=rows.len()).map(|entry| place(entry)..place(entry + 1)).collect();
+        let like = |row: usize| -> Vec<(usize, f64)> {
+            let near =
+                |other: &usize| *other == row || dot(unit.row(row), unit.row(*other)) >= ALIKE;
+            let near: Vec<usize> = (0..rows.len()).filter(near).collect();
+            let all: usize = near.iter().map(|other| of_row[*other].len()).sum();
+            if all == 0 {
+                return vec![(row, 1.0)];
+            }
+            let share = |other: usize| of_row[other].len() as f64 / all as f64;
+            near.into_iter().map(|other| (other, share(other))).collect()
+        };
+        let alike = (0..rows.len()).into_par_iter().map(like).collect();
+        Self { bars: bars(&bank), row_bars: bars(&unit), alike, bank, unit, of_row }
+    }
+
+    /// `[M]` by how much a text fits each row better than what it is compared with: the difference
+    /// of cosines over the better half of the row's masks, then over rows that look alike.
+    fn leads(&self, text: &[f32]) -> Vec<f64> {
+        let over = |bank: &Bank, bars: &[f64]| -> Vec<f64> {
+            scores(bank, text).iter().zip(bars).map(|(own, bar)| own - bar).collect()
+        };
+        let (views, alone) = (over(&self.bank, &self.bars), over(&self.unit, &self.row_bars));
+        let better_half = |(row, of): (usize, &Range<usize>)| -> f64 {
+            let mut all = views[of.clone()].to_vec();
+            if all.is_empty() {
+                return alone[row];
+            }
+            all.sort_unstable_by(|a, b| b.total_cmp(a));
+            let half = (all.len() / 2).max(1);
+            all[..half].iter().sum::<f64>() / half as f64
+        };
+        let rows: Vec<f64> = self.of_row.iter().enumerate().map(better_half).collect();
+        let mean = |alike: &Vec<(usize, f64)>| -> f64 {
+            alike.iter().map(|(row, share)| share * rows[*row]).sum()
+        };
+        self.alike.iter().map(mean).collect()
     }
 }
 

@@ -103,6 +103,11 @@ impl<'a> Views<'a> {
         Self { gaussians, views }
     }
 
+    /// The Gaussians.
+    pub(super) fn gaussians(&self) -> &Gaussians {
+        self.gaussians
+    }
+
     /// `[V]` whether each photo shows Gaussian `i`; its own does.
     pub(super) fn show(&self, i: usize) -> impl Iterator<Item = bool> + '_ {
         let at = center_of(self.gaussians, i);
@@ -110,6 +115,26 @@ impl<'a> Views<'a> {
         let shows = move |view: &View| view.shows(at).is_some();
         let look = move |(v, view): (usize, &Option<View>)| {
             v == source || view.as_ref().is_some_and(shows)
+        };
+        self.views.iter().enumerate().map(look)
+    }
+
+    /// `[V]` what each photo has at Gaussian `i`: an entry, 0 for none, or `None` if the photo does
+    /// not show it. That of its own photo is `own`.
+    pub(super) fn looks<'b>(
+        &'b self,
+        i: usize,
+        own: &'b [u16],
+        maps: &'b [IndexMap],
+    ) -> impl Iterator<Item = Option<u16>> + 'b {
+        let at = center_of(self.gaussians, i);
+        let source = usize::from(self.gaussians.source()[i].view);
+        let look = move |(v, view): (usize, &Option<View>)| {
+            if v == source {
+                return Some(own[i]);
+            }
+            let place = view.as_ref().and_then(|view| view.shows(at));
+            place.zip(maps.get(v)).map(|([x, y], map)| map.at(x, y))
         };
         self.views.iter().enumerate().map(look)
     }
@@ -122,16 +147,7 @@ impl<'a> Views<'a> {
         own: &'b [u16],
         maps: &'b [IndexMap],
     ) -> impl Iterator<Item = u16> + 'b {
-        let at = center_of(self.gaussians, i);
-        let source = usize::from(self.gaussians.source()[i].view);
-        let look = move |(v, view): (usize, &Option<View>)| {
-            if v == source {
-                return own[i];
-            }
-            let place = view.as_ref().and_then(|view| view.shows(at));
-            place.zip(maps.get(v)).map_or(0, |([x, y], map)| map.at(x, y))
-        };
-        self.views.iter().enumerate().map(look)
+        self.looks(i, own, maps).map(Option::unwrap_or_default)
     }
 
     /// `[N]` the entry with the most votes for each Gaussian. A photo without an entry for it does

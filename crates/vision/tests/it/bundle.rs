@@ -56,13 +56,16 @@ fn a_missing_file_and_a_missing_manifest_say_which() {
 fn every_file_of_semantics_is_checked_and_its_keys_too() {
     let from = Path::new("../../tests/fixtures/colours");
     let whole = Bundle::open(from).unwrap();
-    assert_eq!(whole.files().len(), 6, "{:?}", whole.files());
+    assert_eq!(whole.files().len(), 7, "{:?}", whole.files());
     let dir = tempfile::tempdir().unwrap();
     for entry in whole.files() {
         std::fs::copy(from.join(entry.file), dir.path().join(entry.file)).unwrap();
     }
     let text = std::fs::read_to_string(from.join(MANIFEST)).unwrap();
     for (from, to, named) in [
+        ("views_min = 5", "views_min = 2", "geometry.many.views_min is 2"),
+        ("views_min = 5", "views_min = 9", "geometry.many.views_min is 9"),
+        ("views_min = 5\nfile = \"", "views_min = 5\nfile = \"../", "plain file name"),
         ("adapter = \"sam\"", "adapter = \"other\"", "unknown variant"),
         ("size = 64", "size = 0", "masks.size is 0"),
         ("levels = [0, 1, 2]", "levels = []", "masks.levels is []"),

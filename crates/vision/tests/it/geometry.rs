@@ -1,7 +1,7 @@
 //! A stand-in network whose answer is known (every pixel on the plane z = near of its camera):
 //! what comes out of it must lie where the photos' own cameras say, whatever their shape.
 
-use std::{collections::HashSet, sync::atomic::AtomicBool};
+use std::{collections::HashSet, path::Path, sync::atomic::AtomicBool};
 
 use glam::{DMat3, DMat4, DVec3};
 use segsplat_core::{
@@ -14,6 +14,7 @@ use segsplat_vision::{
 };
 
 use segsplat_testing::{opened, root};
+use sha2::{Digest, Sha256};
 
 use crate::network_options;
 
@@ -23,8 +24,12 @@ const DEPTH: f64 = 4.0;
 static GO_ON: AtomicBool = AtomicBool::new(false);
 
 fn network() -> Option<Geometry> {
-    let bundle = Bundle::open(&root().join("tests/fixtures/plane")).unwrap();
+    opened_in(&root().join("tests/fixtures/plane"))
+}
+
+fn opened_in(dir: &Path) -> Option<Geometry> {
     let runtime = opened(Runtime::load(&network_options()))?;
+    let bundle = Bundle::open(dir).unwrap();
     Some(Geometry::open(&runtime, &bundle, &network_options()).unwrap())
 }
 
@@ -56,14 +61,19 @@ fn photo(width: u32, height: u32, center: DVec3, turn: f64) -> PosedPhoto {
 /// The CPU's file is made by a script that looks for the sweeps in an export. Without the operator
 /// all samples of a sweep are in memory: 576 MB for four photos, and their products.
 #[test]
-fn the_embedded_file_for_cpus_sweeps_by_the_operator_of_this_program() {
-    let file = std::fs::read(root().join("models/embedded/geometry_cpu.onnx")).unwrap();
-    // Field 4 of a node, its type: the tag, the length, the name.
-    let nodes = |name: &str| {
-        let field = [&[0x22, name.len() as u8], name.as_bytes()].concat();
-        file.windows(field.len()).filter(|bytes| **bytes == *field).count()
-    };
-    assert_eq!((nodes("Correlate"), nodes("GridSample")), (2, 1));
+fn the_embedded_files_for_cpus_sweep_by_the_operator_of_this_program() {
+    let bundle = Bundle::open(&root().join("models/embedded")).unwrap();
+    let weights = bundle.geometry().weights();
+    assert_eq!(weights.len(), 2, "for few views and for many");
+    for file in weights.iter().map(|weights| weights.cpu_file.unwrap()) {
+        let file = std::fs::read(bundle.path(file)).unwrap();
+        // Field 4 of a node, its type: the tag, the length, the name.
+        let nodes = |name: &str| {
+            let field = [&[0x22, name.len() as u8], name.as_bytes()].concat();
+            file.windows(field.len()).filter(|bytes| **bytes == *field).count()
+        };
+        assert_eq!((nodes("Correlate"), nodes("GridSample")), (2, 1));
+    }
 }
 
 fn run(network: &Geometry, photos: &[PosedPhoto]) -> Result<Vec<ViewGaussians>> {
@@ -80,6 +90,38 @@ fn run(network: &Geometry, photos: &[PosedPhoto]) -> Result<Vec<ViewGaussians>> 
         median_depth: DEPTH,
         neighbors: &neighbors,
     })
+}
+
+#[test]
+fn a_set_goes_through_the_weights_for_its_number_of_views() {
+    let from = root().join("tests/fixtures/plane");
+    let dir = tempfile::tempdir().unwrap();
+    let file = std::fs::read(from.join("plane.onnx")).unwrap();
+    std::fs::write(dir.path().join("plane.onnx"), &file).unwrap();
+    // The same network with opacities of 0.5, not 0.75.
+    let solid = 0.75_f32.to_le_bytes();
+    let at: Vec<usize> = (0..file.len() - 3).filter(|&i| file[i..i + 4] == solid).collect();
+    assert_eq!(at.len(), 1, "the opacity stands once in the file");
+    let mut many = file;
+    many[at[0]..at[0] + 4].copy_from_slice(&0.5_f32.to_le_bytes());
+    std::fs::write(dir.path().join("many.onnx"), &many).unwrap();
+    let sha256: String = Sha256::digest(&many).iter().map(|b| format!("{b:02x}")).collect();
+    let section = "[geometry.many]\nviews_min = 4\nfile = \"many.onnx\"\nsha256 = ";
+    let text = std::fs::read_to_string(from.join("bundle.toml")).unwrap();
+    let text =
+        text.replace("[geometry.inputs]", &format!("{section}{sha256:?}\n[geometry.inputs]"));
+    std::fs::write(dir.path().join("bundle.toml"), text).unwrap();
+    let Some(network) = opened_in(dir.path()) else { return };
+    for (views, opacity) in [(2, 0.75), (3, 0.75), (4, 0.5), (8, 0.5)] {
+        let place = |i: u32| DVec3::new(0.3 * f64::from(i), 0.0, 0.0);
+        let photos: Vec<PosedPhoto> = (0..views).map(|i| photo(60, 60, place(i), 0.0)).collect();
+        let made = run(&network, &photos).unwrap();
+        assert_eq!(made.len(), photos.len());
+        assert!(made.iter().flat_map(|view| &view.opacities).all(|&a| a == opacity), "{views}");
+    }
+    for part in ["geometry", "geometry.many"] {
+        assert!(network.network(part).is_some(), "{part}");
+    }
 }
 
 fn lifted(network: &Geometry, photos: &[PosedPhoto]) -> Lifted {

@@ -34,6 +34,7 @@ mod sample;
 mod score;
 mod segment;
 mod thin;
+mod tracks;
 mod union;
 mod votes;
 

@@ -66,24 +66,31 @@ fn the_geometry_network_finds_the_depth_of_the_room() {
     }
 }
 
-/// All numbers that the network gives for two photos of a room.
-fn answer(bundle: &Bundle, runtime: &Arc<Runtime>) -> Vec<f32> {
-    let network = Geometry::open(runtime, bundle, &network_options()).unwrap();
-    let options = SampleOptions { photos: 2, width: 256, height: 256, seed: 1 };
+/// All numbers that the network gives for so many photos of a room.
+fn answer(network: &Geometry, count: usize) -> Vec<f32> {
+    let options = SampleOptions { photos: count, width: 256, height: 256, seed: 1 };
     let photos: Vec<PosedPhoto> = sample::photos(&options).unwrap();
+    let others = |v: usize| (0..count).filter(|&other| other != v).take(3).collect();
     let input = GeometryInput {
         photos: &photos,
-        views: &[0, 1],
-        near_far: &[[1.5, 8.0]; 2],
+        views: &(0..count).collect::<Vec<_>>(),
+        near_far: &vec![[1.5, 8.0]; count],
         median_depth: 3.0,
-        neighbors: &[vec![1], vec![0]],
+        neighbors: &(0..count).map(others).collect::<Vec<Vec<usize>>>(),
     };
     let views = network.run(&input).unwrap();
     views.iter().flat_map(|view| view.means.iter().chain(&view.sh).flatten().copied()).collect()
 }
 
+/// A manifest without a section.
+fn without(text: &str, section: &str) -> String {
+    let (before, after) = text.split_once(section).expect("the section is there");
+    let (_, after) = after.split_once("\n[").unwrap();
+    format!("{before}[{after}")
+}
+
 #[test]
-fn the_cpus_own_file_of_geometry_agrees_with_the_plain_one() {
+fn the_cpus_own_files_of_geometry_agree_with_the_plain_ones() {
     let Some(runtime) = runtime() else { return };
     let from = root().join("models/embedded");
     let plain = tempfile::tempdir().unwrap();
@@ -92,21 +99,24 @@ fn the_cpus_own_file_of_geometry_agrees_with_the_plain_one() {
         std::os::unix::fs::symlink(file.path(), plain.path().join(file.file_name())).unwrap();
     }
     let text = std::fs::read_to_string(from.join("bundle.toml")).unwrap();
-    let (before, after) = text.split_once("[geometry.cpu]").expect("the section of the CPU's file");
-    let (_, after) = after.split_once("\n[").unwrap();
+    let text = without(&without(&text, "[geometry.cpu]"), "[geometry.many.cpu]");
     std::fs::remove_file(plain.path().join("bundle.toml")).unwrap();
-    std::fs::write(plain.path().join("bundle.toml"), format!("{before}[{after}")).unwrap();
-    let own = answer(&bundle(), &runtime);
-    let wanted = answer(&Bundle::open(plain.path()).unwrap(), &runtime);
-    assert_eq!(own.len(), wanted.len());
-    let squares = |values: &mut dyn Iterator<Item = f32>| -> f64 {
-        values.map(|v| f64::from(v).powi(2)).sum()
-    };
-    let off = squares(&mut own.iter().zip(&wanted).map(|(a, b)| a - b));
-    let share = (off / squares(&mut wanted.iter().copied())).sqrt();
-    println!("the CPU's file differs by {share:.4}");
-    assert!(share > 0.0, "it is another file");
-    assert!(share < OWN_FILE_MAX, "the CPU's file differs by {share}");
+    std::fs::write(plain.path().join("bundle.toml"), text).unwrap();
+    let bundles = [bundle(), Bundle::open(plain.path()).unwrap()];
+    let [own, plain] =
+        bundles.map(|bundle| Geometry::open(&runtime, &bundle, &network_options()).unwrap());
+    for views in [2, 4] {
+        let (own, wanted) = (answer(&own, views), answer(&plain, views));
+        assert_eq!(own.len(), wanted.len());
+        let squares = |values: &mut dyn Iterator<Item = f32>| -> f64 {
+            values.map(|v| f64::from(v).powi(2)).sum()
+        };
+        let off = squares(&mut own.iter().zip(&wanted).map(|(a, b)| a - b));
+        let share = (off / squares(&mut wanted.iter().copied())).sqrt();
+        println!("{views} views: the CPU's file differs by {share:.4}");
+        assert!(share > 0.0, "it is another file");
+        assert!(share < OWN_FILE_MAX, "{views} views: the CPU's file differs by {share}");
+    }
 }
 
 /// The pixel of a thing that is farthest from its edges, by the largest square around it.

@@ -7,7 +7,7 @@ use std::{
 
 use rayon::prelude::*;
 use segsplat_core::error::Result;
-use segsplat_core::scene::{Bank, PixelWeights, Preset, ScoringMethod};
+use segsplat_core::scene::{Bank, PixelWeights, Preset, RowViews, ScoringMethod};
 use segsplat_testing::labels::mask_of_blends;
 use segsplat_vision::semantics::{Scorer, Scoring, ViewNorms};
 
@@ -326,5 +326,68 @@ fn a_text_must_be_among_the_words_that_fit_an_entry_best() {
         assert_eq!(selects(0.05, 0.0, unit_rows), [true; 2]);
         assert_eq!(selects(0.15, 0.0, unit_rows), [false; 2]);
         assert_eq!(selects(0.95, 1.0, unit_rows), [true; 2]);
+    }
+}
+
+/// At `degrees` from X.
+fn at(degrees: f32) -> [f32; 2] {
+    let angle = degrees.to_radians();
+    [angle.cos(), angle.sin()]
+}
+
+/// Rows that stand for masks at these degrees, against Y.
+fn seen(rows: &[&[f32]]) -> Scorer {
+    let mean = |of: &&[f32]| -> [f32; 2] {
+        let sum =
+            of.iter().map(|degrees| at(*degrees)).fold([0.0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]);
+        sum.map(|v| v / of.len() as f32)
+    };
+    let bank = Bank { dim: 2, rows: rows.iter().flat_map(mean).collect() };
+    let of = |(entry, of): (u16, &&[f32])| vec![entry; of.len()];
+    let views = RowViews {
+        entries: (1..).zip(rows).flat_map(of).collect(),
+        rows: rows.iter().flat_map(|of| of.iter().flat_map(|degrees| at(*degrees))).collect(),
+    };
+    let scoring = all_over_the_canon(&[Y]);
+    Scorer::new(&bank, scoring).unwrap().with_views(&views).unwrap()
+}
+
+#[test]
+fn a_text_is_compared_with_the_better_half_of_the_masks_of_a_row() {
+    let lead = |degrees: f32| at(degrees)[0] - at(degrees)[1];
+    let sigmoid = |lead: f32| 1.0 / (1.0 + (-10.0 * lead).exp());
+    let close = |scorer: &Scorer, want: f32| {
+        let relevancy = scorer.text(&X).unwrap().relevancies()[1];
+        assert!((relevancy - sigmoid(want)).abs() < 1e-5, "{relevancy} {}", sigmoid(want));
+    };
+    // X is nearer than Y under 45 degrees. The mean of all four is over them.
+    close(&seen(&[&[80.0, 43.0, 75.0, 41.0]]), (lead(43.0) + lead(41.0)) / 2.0);
+    close(&seen(&[&[80.0, 41.0, 75.0]]), lead(41.0));
+    close(&seen(&[&[41.0]]), lead(41.0));
+    assert!(seen(&[&[80.0, 43.0, 75.0, 41.0]]).text(&X).unwrap().selects(1));
+    let bank = Bank { dim: 2, rows: at(60.0).to_vec() };
+    let alone = Scorer::new(&bank, all_over_the_canon(&[Y])).unwrap();
+    assert!(!alone.text(&X).unwrap().selects(1), "a row without views is its mean");
+}
+
+#[test]
+fn rows_that_look_alike_are_judged_together_and_others_are_not() {
+    // 50 and 40 degrees are alike, -20 degrees is like 40 but not like 110.
+    let scorer = seen(&[&[50.0], &[40.0], &[110.0]]);
+    let text = scorer.text(&X).unwrap();
+    assert_eq!([1, 2, 3].map(|m| text.selects(m)), [true, true, false]);
+    // Three masks of 50 degrees outweigh one of 40.
+    let text = seen(&[&[50.0, 50.0, 50.0], &[40.0]]).text(&X).unwrap();
+    assert_eq!([1, 2].map(|m| text.selects(m)), [false, false]);
+    let text = seen(&[&[100.0, 100.0], &[40.0]]).text(&X).unwrap();
+    assert_eq!([1, 2].map(|m| text.selects(m)), [false, true], "60 degrees apart is another look");
+}
+
+#[test]
+fn views_of_another_bank_are_refused() {
+    let bank = Bank { dim: 2, rows: X.to_vec() };
+    for (entries, rows) in [(vec![2], X.to_vec()), (vec![0], X.to_vec()), (vec![1], vec![1.0])] {
+        let scorer = Scorer::new(&bank, all_over_the_canon(&[Y])).unwrap();
+        assert!(scorer.with_views(&RowViews { entries, rows }).is_err());
     }
 }

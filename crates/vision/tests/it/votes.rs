@@ -10,7 +10,7 @@ const SIDE: u16 = 20;
 
 /// Cameras one unit apart that look along z at a wall 10 units away; a photo is twice as large
 /// as the network's picture of it.
-fn cameras(count: usize) -> Vec<SceneCamera> {
+pub(crate) fn cameras(count: usize) -> Vec<SceneCamera> {
     let lens = |scale: f64, side: u32| Intrinsics {
         fx: 20.0 * scale,
         fy: 20.0 * scale,
@@ -32,7 +32,7 @@ fn cameras(count: usize) -> Vec<SceneCamera> {
 }
 
 /// A Gaussian for every pixel of every photo; `depth` says how far.
-fn wall(count: u16, depth: impl Fn(SourcePixel) -> f64) -> Gaussians {
+pub(crate) fn wall(count: u16, depth: impl Fn(SourcePixel) -> f64) -> Gaussians {
     let mut raw = RawGaussians::default();
     for view in 0..count {
         for (x, y) in (0..SIDE).flat_map(|y| (0..SIDE).map(move |x| (x, y))) {
