@@ -19,13 +19,6 @@ const OTHER_PHOTO = /\.(hei[cf]|avif|dng|jxl)$/i;
 const ONLY_SERVER = /\.tiff?$/i;
 const AS_JPEG =
   'export it as JPEG (iPhone: Settings, Camera, Formats, Most Compatible; a Mac: Preview, Export)';
-const NO_CAMERAS =
-  'No cameras: add a transforms.json, a cameras.json, or the folder of a capture with them. ' +
-  'For photos alone, three lines of Python find their cameras (pip install pycolmap):\n' +
-  'pycolmap.extract_features("photos/database.db", "photos/images")\n' +
-  'pycolmap.match_exhaustive("photos/database.db")\n' +
-  'pycolmap.incremental_mapping("photos/database.db", "photos/images", "photos/sparse")\n' +
-  'Then drop the folder "photos". The page docs/captures.md of this program says more.';
 const fileName = (path) => path.split('/').pop();
 
 // All files of a drop, with the paths that they have in dropped folders.
@@ -96,7 +89,12 @@ async function readCapture(files, at) {
     return capture;
   }
   if (!json) {
-    faults.push(NO_CAMERAS);
+    // The server finds their cameras.
+    const shown = photos.filter(({ path }) => !unread(path));
+    for (const { path } of shown) rows.push({ name: path, faults: [] });
+    if (shown.length === 1) faults.push('One photo: a scene needs two or more.');
+    if (shown.length > 1) notes.push('No cameras: the server finds them from the photos.');
+    for (const { path, file } of await fit(shown, true, notes, at)) form.append(path, file, path);
     return capture;
   }
   let read, list, part;

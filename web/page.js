@@ -18,6 +18,7 @@ const SHORT = { dateStyle: 'medium', timeStyle: 'short' };
 // What the server is at, for people.
 const STAGES = {
   photos: 'reading the photos',
+  cameras: 'finding the cameras',
   capture: 'checking the cameras',
   geometry: 'finding the shapes',
   lift: 'making Gaussians',

@@ -7,6 +7,7 @@
 //! of this tree, and `report` makes the tables of the page from the rows ([`report`]).
 
 mod bench;
+mod cameras;
 mod density;
 mod frames;
 mod grid;
@@ -57,6 +58,8 @@ enum Command {
     Photos(photos::Args),
     /// Compare scenes of many photos with photos that were held out, refined or not
     Many(many::Args),
+    /// Hide the cameras of captures, solve them, and compare them
+    Cameras(cameras::Args),
     /// Compare thinned scenes with scenes of all Gaussians
     Density(setup::Inputs),
     /// Compare views that show scenes smaller than their photos with those of their own size
@@ -117,6 +120,7 @@ pub fn run(cli: &Cli) -> Result<Vec<serde_json::Value>> {
     match &cli.command {
         Command::Photos(args) => photos::run(args, &mut rows)?,
         Command::Many(args) => many::run(args, &mut rows)?,
+        Command::Cameras(args) => cameras::run(args, &mut rows)?,
         Command::Density(args) => density::run(args, &mut rows)?,
         Command::Afar(inputs) => pairs::afar(inputs, &mut rows)?,
         Command::Exports(inputs) => pairs::exports(inputs, &mut rows)?,

@@ -160,7 +160,7 @@ pub(crate) fn make_keeping(
     photos: &[PosedPhoto],
     options: &SceneOptions,
 ) -> Result<(Reconstruction, Seen)> {
-    let photos = PhotoSet { photos: photos.to_vec(), warnings: Vec::new(), read_ms: 0.0 };
+    let photos = PhotoSet::given(photos.to_vec(), Vec::new(), 0.0);
     pipeline::make_keeping(engine, &photos, options, SILENT)
 }
 

@@ -740,6 +740,9 @@ pub struct CreateSceneHeader {
     /// is set.
     #[prost(string, tag = "10")]
     pub refine: ::prost::alloc::string::String,
+    /// Whether the cameras of the upload are used, or solved from the photos.
+    #[prost(enumeration = "CamerasMode", tag = "11")]
+    pub cameras_mode: i32,
     /// Camera description; left out when it is among the files or in the archive.
     #[prost(oneof = "create_scene_header::Cameras", tags = "1, 2")]
     pub cameras: ::core::option::Option<create_scene_header::Cameras>,
@@ -971,6 +974,51 @@ pub struct HealthReport {
     /// Gaussians: views are drawn so unless they say otherwise.
     #[prost(bool, tag = "16")]
     pub antialiased: bool,
+    /// Where the cameras come from.
+    #[prost(message, optional, tag = "17")]
+    pub cameras: ::core::option::Option<CamerasReport>,
+}
+/// What is known of the cameras of a scene.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct CamerasReport {
+    /// Where they come from.
+    #[prost(enumeration = "CamerasSource", tag = "1")]
+    pub source: i32,
+    /// How likely solved cameras are right, 0..1; left out of given ones.
+    #[prost(double, optional, tag = "2")]
+    pub confidence: ::core::option::Option<f64>,
+    /// Solved cameras: their photos, in the order of the scene's cameras.
+    #[prost(message, repeated, tag = "3")]
+    pub placed: ::prost::alloc::vec::Vec<PlacedPhoto>,
+    /// Photos that are no part of the scene, since their cameras could not be solved.
+    #[prost(message, repeated, tag = "4")]
+    pub left_out: ::prost::alloc::vec::Vec<LeftOutPhoto>,
+}
+/// A photo whose camera was solved.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct PlacedPhoto {
+    /// File name of the photo.
+    #[prost(string, tag = "1")]
+    pub file: ::prost::alloc::string::String,
+    /// Keypoints that agree with the points of the scene.
+    #[prost(uint64, tag = "2")]
+    pub inliers: u64,
+    /// Root of the mean squared distance of these to their points, pixels of the photo.
+    #[prost(double, tag = "3")]
+    pub error_px: f64,
+    /// Radial distortion that was taken out of the photo: k1 of OpenCV's model.
+    #[prost(double, tag = "4")]
+    pub k1: f64,
+}
+/// A photo whose camera could not be solved.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct LeftOutPhoto {
+    /// File name of the photo.
+    #[prost(string, tag = "1")]
+    pub file: ::prost::alloc::string::String,
+    /// Why, a sentence.
+    #[prost(string, tag = "2")]
+    pub reason: ::prost::alloc::string::String,
 }
 /// How many Gaussians were dropped or clamped for one reason.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1398,6 +1446,39 @@ impl Semantics {
         }
     }
 }
+/// Whether the cameras of an upload are used.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum CamerasMode {
+    /// As CAMERAS_MODE_AUTO.
+    Unspecified = 0,
+    /// Those that the upload has; they are solved where it has none.
+    Auto = 1,
+    /// They are solved from the photos, whatever the upload has.
+    Solve = 2,
+}
+impl CamerasMode {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "CAMERAS_MODE_UNSPECIFIED",
+            Self::Auto => "CAMERAS_MODE_AUTO",
+            Self::Solve => "CAMERAS_MODE_SOLVE",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "CAMERAS_MODE_UNSPECIFIED" => Some(Self::Unspecified),
+            "CAMERAS_MODE_AUTO" => Some(Self::Auto),
+            "CAMERAS_MODE_SOLVE" => Some(Self::Solve),
+            _ => None,
+        }
+    }
+}
 /// How many of the network's Gaussians a scene keeps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
@@ -1599,6 +1680,39 @@ impl SemanticsState {
             "SEMANTICS_STATE_RUNNING" => Some(Self::Running),
             "SEMANTICS_STATE_READY" => Some(Self::Ready),
             "SEMANTICS_STATE_FAILED" => Some(Self::Failed),
+            _ => None,
+        }
+    }
+}
+/// Where the cameras of a scene come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum CamerasSource {
+    /// Not used.
+    Unspecified = 0,
+    /// They came with the photos.
+    Given = 1,
+    /// They were computed from the photos.
+    Solved = 2,
+}
+impl CamerasSource {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "CAMERAS_SOURCE_UNSPECIFIED",
+            Self::Given => "CAMERAS_SOURCE_GIVEN",
+            Self::Solved => "CAMERAS_SOURCE_SOLVED",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "CAMERAS_SOURCE_UNSPECIFIED" => Some(Self::Unspecified),
+            "CAMERAS_SOURCE_GIVEN" => Some(Self::Given),
+            "CAMERAS_SOURCE_SOLVED" => Some(Self::Solved),
             _ => None,
         }
     }

@@ -103,7 +103,8 @@ fn folder(
 ) -> Result<()> {
     let scene = scene_file::open(&args.scene, &config.limits)?.scene;
     let photos = args.photos.as_deref();
-    let upload = photos.map(|path| reconstruct::upload(path, config)).transpose()?;
+    let mode = scene.meta.provenance.options.cameras;
+    let upload = photos.map(|path| reconstruct::upload(path, mode, config)).transpose()?;
     let service = engine::offline(config, format.lines)?;
     let unwritable = |e| scene_file::unwritable(&args.output, e);
     // Half a zip is of no use, and what was there before stays until there is a whole one.

@@ -6,6 +6,7 @@
 
 mod bench;
 mod camera;
+mod cameras;
 pub mod engine;
 mod export;
 mod features;
@@ -35,7 +36,7 @@ use crate::{
     telemetry,
 };
 
-/// Posed photos in; a 3D Gaussian scene and views at any pose out.
+/// Photos in; a 3D Gaussian scene and views at any pose out.
 #[derive(Debug, Parser)]
 #[command(name = "segsplat", version, propagate_version = true)]
 struct Cli {
@@ -57,8 +58,10 @@ enum Command {
     Keys(keys::Args),
     /// Ask a running server whether it is ready
     Health(Box<health::Args>),
-    /// Make a scene of a folder (or archive) of photos and their cameras
+    /// Make a scene of a folder (or archive) of photos, with their cameras or without
     Reconstruct(reconstruct::Args),
+    /// Find the cameras of photos, and write them as a transforms.json
+    Cameras(cameras::Args),
     /// Render a view of a scene
     Render(Box<render::Args>),
     /// Search a scene by text, in 3D and in a view
@@ -84,6 +87,7 @@ impl Command {
             Self::Serve(args) => args.config.clone(),
             Self::Health(args) => AllArgs { listen: args.listen.clone(), ..AllArgs::default() },
             Self::Reconstruct(args) => common(&args.config),
+            Self::Cameras(args) => common(&args.config),
             Self::Render(args) => common(&args.config),
             Self::Query(args) => common(&args.config),
             Self::Features(args) => common(&args.config),
@@ -154,6 +158,7 @@ fn dispatch(cli: &Cli, out: &Output) -> Result<()> {
         Command::Keys(args) => keys::run(args, out),
         Command::Health(args) => health::run(args, &config, out),
         Command::Reconstruct(args) => reconstruct::run(args, &config, out),
+        Command::Cameras(args) => cameras::run(args, &config, out),
         Command::Render(args) => render::run(args, &config, out),
         Command::Query(args) => query::run(args, &config, out),
         Command::Features(args) => features::run(args, &config, out),

@@ -27,14 +27,14 @@ use crate::{
     limits::Limits,
     names::named,
     pipeline::{
-        self, PhotoSet, Pipeline, Seen, make_for_refinement,
+        self, PhotoSet, Pipeline, ReadSet, Seen, cameras, make_for_refinement,
         refinement::{RefineCalls, refined, reported, version_of},
         semantics::{SemanticsInput, understand},
     },
     refine::{RefineOptions, RefinedVersion},
     scene::{
-        Density, PhotoHash, Preset, Provenance, Refine, RefineReport, Scene, SceneId, SceneMeta,
-        SceneOptions, SemanticsMode, Stage, Upload, Watch,
+        CamerasMode, Density, PhotoHash, Preset, Provenance, Refine, RefineReport, Scene, SceneId,
+        SceneMeta, SceneOptions, SemanticsMode, Stage, Upload, Watch,
     },
     service::{check_refine, scene_splats},
     store::{self, write_scene_file, write_semantics_file},
@@ -49,6 +49,9 @@ pub(super) struct Args {
     #[arg(help = format!("Scene file to write; with an ending of these that format: {}",
         ExportFormat::listed(|of| of.is_splats(), |row| row.ending)))]
     output: PathBuf,
+    /// `solve` computes the cameras from the photos also where some are there
+    #[arg(long, value_parser = named::<CamerasMode>, default_value = "auto")]
+    cameras: CamerasMode,
     /// Views that the network takes at once [default: 4]
     #[arg(long)]
     max_views: Option<usize>,
@@ -75,6 +78,7 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let options = SceneOptions {
         max_views: args.max_views,
+        cameras: args.cameras,
         semantics: args.semantics,
         preset: args.preset,
         density: args.density,
@@ -99,7 +103,11 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         |stage: Stage, fraction: f32| out.progress(stage.name(), stage.overall(fraction));
     let watch = Watch { progress: &progress, cancel: &AtomicBool::new(false) };
     progress(Stage::Photos, 0.0);
-    let (photos, upload) = read(&args.photos, config, watch.cancel)?;
+    let (read, upload) = read(&args.photos, args.cameras, config, watch.cancel)?;
+    let photos = match read {
+        ReadSet::Posed(photos) => photos,
+        ReadSet::Unposed(photos) => cameras::posed(&engine, photos, watch)?,
+    };
     let refiner = match args.refine {
         Refine::Off => None,
         _ => {
@@ -219,18 +227,23 @@ fn id_of(provenance: &Provenance) -> SceneId {
 }
 
 /// The photos of a folder or an archive, and the files that were read.
-fn read(path: &Path, config: &Config, cancel: &AtomicBool) -> Result<(PhotoSet, Upload)> {
+pub(super) fn read(
+    path: &Path,
+    mode: CamerasMode,
+    config: &Config,
+    cancel: &AtomicBool,
+) -> Result<(ReadSet, Upload)> {
     if path.is_dir() {
-        return pipeline::read_dir(path, &config.limits, cancel);
+        return pipeline::read_dir(path, mode, &config.limits, cancel);
     }
     let upload = archive(path, config)?;
-    Ok((pipeline::read(&upload, &config.limits, cancel)?, upload))
+    Ok((pipeline::read(&upload, mode, &config.limits, cancel)?, upload))
 }
 
 /// The files of a folder or an archive that a scene is made of.
-pub(super) fn upload(path: &Path, config: &Config) -> Result<Upload> {
+pub(super) fn upload(path: &Path, mode: CamerasMode, config: &Config) -> Result<Upload> {
     match path.is_dir() {
-        true => read(path, config, &AtomicBool::new(false)).map(|(_, upload)| upload),
+        true => read(path, mode, config, &AtomicBool::new(false)).map(|(_, upload)| upload),
         false => archive(path, config),
     }
 }
@@ -294,6 +307,10 @@ fn describe(path: &Path, scene: &Scene, total_ms: f64, out: &Output) -> Result<(
             |psnr: &Option<f64>| psnr.map_or("unknown".to_owned(), |psnr| format!("{psnr:.2} dB"));
         let (before, after) = (of(psnr_before), of(psnr_after));
         let _ = writeln!(text, "  refined: {steps} steps, held-out photos {before} to {after}");
+    }
+    if let Some(confidence) = report.cameras.confidence {
+        let placed = report.cameras.placed.len();
+        let _ = writeln!(text, "  cameras: {placed} solved, confidence {confidence:.2}");
     }
     for warning in &report.warnings {
         let _ = writeln!(text, "  warning: {}", warning.message);

@@ -6,7 +6,7 @@ use crate::{
     error::{Error, ErrorCode, Result},
     models::Provider,
     pipeline::{
-        self, PhotoSet, Pipeline, PipelineLoader, Reconstruction, Seen,
+        self, PhotoSet, Pipeline, PipelineLoader, Reconstruction, Seen, UnposedSet,
         semantics::{SemanticsInput, label_photos},
     },
     refine::split,
@@ -70,6 +70,15 @@ pub trait SceneNetworks: Send + Sync {
         Err(Error::new(ErrorCode::ModelUnavailable, "there are no networks"))
     }
 
+    /// Finds the cameras of photos that came without, on the calling thread.
+    ///
+    /// # Errors
+    /// Any code; it becomes the scene's `error`.
+    fn pose(&self, _: UnposedSet, _: Watch<'_>) -> Result<PhotoSet> {
+        let why = "no network finds the cameras of photos; send cameras with them";
+        Err(Error::new(ErrorCode::ModelUnavailable, why))
+    }
+
     /// Does the whole work on the calling thread.
     ///
     /// # Errors
@@ -110,7 +119,7 @@ pub trait SceneNetworks: Send + Sync {
         watch: Watch<'_>,
     ) -> Result<(Reconstruction, Gaussians)> {
         let kept = split(&photos.photos, held).0;
-        let kept = PhotoSet { photos: kept, warnings: Vec::new(), read_ms: 0.0 };
+        let kept = PhotoSet::given(kept, Vec::new(), 0.0);
         let made = self.make(&kept, options, watch)?;
         let one_set = made.gaussians.clone();
         Ok((made, one_set))
@@ -244,6 +253,10 @@ impl SceneNetworks for PipelineNetworks {
             let why = "the networks are being opened; ask again";
             Err(Error::new(ErrorCode::ModelUnavailable, why).retry_after_s(OPENING_RETRY_S))
         })
+    }
+
+    fn pose(&self, photos: UnposedSet, watch: Watch<'_>) -> Result<PhotoSet> {
+        pipeline::cameras::posed(self.0.get()?, photos, watch)
     }
 
     fn make(

@@ -12,8 +12,11 @@ use crate::{
     error::{Error, Result},
     formats::table::read_splats,
     limits::Limits,
-    pipeline::{self, PhotoSet, Seen},
-    scene::{PhotoHash, Scene, SceneId, SceneOptions, SemanticsMode, Stage, StageTime, Upload},
+    pipeline::{self, PhotoSet, ReadSet, Seen, UnposedSet},
+    scene::{
+        PhotoHash, Scene, SceneId, SceneOptions, SceneStatus, SemanticsMode, Stage, StageTime,
+        Upload,
+    },
     store,
 };
 
@@ -28,6 +31,8 @@ pub(super) struct ReadUpload {
 #[derive(Clone, Debug)]
 pub(super) enum Content {
     Photos(PhotoSet),
+    /// Photos whose cameras are not solved yet.
+    Unposed(UnposedSet),
     /// A file of Gaussians as a scene that has no id yet.
     Splats(Box<Scene>),
 }
@@ -42,7 +47,10 @@ impl ReadUpload {
         cancel: &AtomicBool,
     ) -> Result<Self> {
         let read = || match &upload.splats {
-            None => pipeline::read(upload, limits, cancel).map(Content::Photos),
+            None => Ok(match pipeline::read(upload, options.cameras, limits, cancel)? {
+                ReadSet::Posed(photos) => Content::Photos(photos),
+                ReadSet::Unposed(photos) => Content::Unposed(photos),
+            }),
             Some(file) => {
                 let begun = Instant::now();
                 let read = read_splats(&mut &file.bytes[..], &file.name, limits)?;
@@ -57,11 +65,31 @@ impl ReadUpload {
         Ok(Self { files, content: content? })
     }
 
-    /// The photos.
+    /// As it is once the scene of this status is made: photos that came without cameras have those
+    /// of the scene.
+    pub(super) fn of_scene(self, status: &SceneStatus) -> Self {
+        let content = match (self.content, &status.report) {
+            (Content::Unposed(photos), Some(report)) => {
+                Content::Photos(photos.posed_as(&status.cameras, &report.cameras))
+            }
+            (content, _) => content,
+        };
+        Self { content, ..self }
+    }
+
+    /// Whether it is photos, and no file of Gaussians.
+    pub(super) fn is_of_photos(&self) -> bool {
+        !matches!(self.content, Content::Splats(_))
+    }
+
+    /// The photos with their cameras.
     /// Fails with `invalid_request` where it is a file of Gaussians.
     pub(super) fn photos(&self) -> Result<&PhotoSet> {
         match &self.content {
             Content::Photos(photos) => Ok(photos),
+            Content::Unposed(_) => {
+                Err(Error::internal("the cameras of the photos are not solved yet"))
+            }
             Content::Splats(_) => {
                 Err(Error::invalid("the scene is a file of Gaussians; it has no photos"))
             }
@@ -82,6 +110,7 @@ impl ReadUpload {
     pub(super) fn room(&self, limits: &Limits) -> usize {
         match &self.content {
             Content::Photos(photos) => photos.photos.len(),
+            Content::Unposed(photos) => photos.photos.len(),
             Content::Splats(scene) => {
                 let share = scene.size_bytes() as f64 / limits.splats_bytes_max.max(1) as f64;
                 (share * limits.photos_max as f64).ceil() as usize
@@ -93,6 +122,7 @@ impl ReadUpload {
     pub(super) fn size_bytes(&self) -> u64 {
         match &self.content {
             Content::Photos(photos) => photos.size_bytes(),
+            Content::Unposed(photos) => photos.size_bytes(),
             Content::Splats(scene) => scene.size_bytes(),
         }
     }
@@ -219,7 +249,7 @@ mod tests {
         let camera = Camera { intrinsics, camera_to_world };
         let photo = Photo { width: 1, height: 1, rgb: vec![0; bytes], valid: None };
         let posed = PosedPhoto { file: String::new(), photo, camera, intrinsics_made_for: None };
-        let photos = PhotoSet { photos: vec![posed], warnings: Vec::new(), read_ms: 0.0 };
+        let photos = PhotoSet::given(vec![posed], Vec::new(), 0.0);
         Arc::new(ReadUpload { files: Vec::new(), content: Content::Photos(photos) })
     }
 

@@ -18,8 +18,8 @@ use super::{
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::{
-        Provenance, Scene, SceneError, SceneId, SceneMeta, SceneState, SceneStatus, SemanticsMode,
-        SemanticsState, SemanticsStatus, Stage,
+        CamerasSource, Provenance, Scene, SceneError, SceneId, SceneMeta, SceneState, SceneStatus,
+        SemanticsMode, SemanticsState, SemanticsStatus, Stage, Watch,
     },
     store::{self, Record},
     telemetry::{self, meter},
@@ -147,7 +147,7 @@ impl Jobs {
             return Ok((Made::Kept(scene), None));
         }
         let (files, of_photos) = match self.uploads.find(id) {
-            Some(upload) => (upload.files.clone(), upload.photos().is_ok()),
+            Some(upload) => (upload.files.clone(), upload.is_of_photos()),
             None => {
                 let upload = store.upload(id)?;
                 (store::hashes(&upload), upload.splats.is_none())
@@ -166,6 +166,7 @@ impl Jobs {
             let limits = self.parts.limits.get();
             let room = upload.room(&limits);
             let _room = self.room.take(room, limits.photos_max, watch.cancel)?;
+            let upload = self.with_cameras(id, upload, watch)?;
             let Content::Photos(photos) = &upload.content else {
                 self.uploads.forget(id);
                 return of_file(upload, id, created_ms, provenance);
@@ -173,7 +174,9 @@ impl Jobs {
             match record.options.semantics {
                 SemanticsMode::Eager => {
                     self.uploads.keep(id, Arc::clone(&upload));
-                    if self.parts.semantics.begin_early(&record.options.method()) {
+                    // The photos may go from memory, and a job that reads them again has no cameras.
+                    let is_given = photos.cameras.source == CamerasSource::Given;
+                    if is_given && self.parts.semantics.begin_early(&record.options.method()) {
                         self.understand_early(id)?;
                     }
                 }
@@ -195,6 +198,27 @@ impl Jobs {
             Ok(made.into_scene(id.clone(), created_ms, provenance))
         })?;
         Ok((Made::New(Box::new(scene)), lock))
+    }
+
+    /// An upload whose photos have cameras: those that are solved now, where it has none.
+    fn with_cameras(
+        &self,
+        id: &SceneId,
+        upload: Arc<ReadUpload>,
+        watch: Watch<'_>,
+    ) -> Result<Arc<ReadUpload>> {
+        if !matches!(upload.content, Content::Unposed(_)) {
+            return Ok(upload);
+        }
+        (watch.progress)(Stage::Cameras, 0.0);
+        // Not copied: nobody else has it.
+        self.uploads.forget(id);
+        let ReadUpload { files, content } = Arc::unwrap_or_clone(upload);
+        let content = match content {
+            Content::Unposed(photos) => Content::Photos(self.parts.scenes.pose(photos, watch)?),
+            other => other,
+        };
+        Ok(Arc::new(ReadUpload { files, content }))
     }
 
     /// Keeps a scene with the semantics that it has, and its record.

@@ -256,8 +256,10 @@ impl Jobs {
             return Ok(kept);
         }
         let upload = self.parts.store.upload(id)?;
-        let options = &self.record(id)?.options;
-        ReadUpload::of(&upload, options, &self.parts.limits.get(), watch.cancel).map(Arc::new)
+        let record = self.record(id)?;
+        let limits = self.parts.limits.get();
+        let read = ReadUpload::of(&upload, &record.options, &limits, watch.cancel)?;
+        Ok(Arc::new(read.of_scene(&record.status)))
     }
 
     /// Forgets the photos of a finished scene where they are not kept, and no job that may come

@@ -358,7 +358,7 @@ impl Default for CallerLimits {
 pub struct ModelInfo {
     /// What it does: `geometry`, `geometry.cpu`, `geometry.many`, `geometry.many.cpu`,
     /// `masks.encoder`, `masks.decoder`, `image_text.image`, `image_text.text`,
-    /// `image_text.tokenizer`, `image_text.words`.
+    /// `image_text.tokenizer`, `image_text.words`, `features`.
     pub name: String,
     /// File in the bundle.
     pub file: String,

@@ -2,10 +2,7 @@
 //! is refused.
 
 use std::{
-    sync::{
-        Arc, Mutex,
-        atomic::{AtomicBool, Ordering},
-    },
+    sync::{Arc, Mutex, atomic::Ordering},
     time::Duration,
 };
 
@@ -13,7 +10,7 @@ use futures_util::{StreamExt, future::join_all};
 use segsplat::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
-    pipeline::read,
+    photos,
     render::{Frame, RenderRequest, Renderer},
     sample::{self, SampleOptions},
     scene::{
@@ -387,7 +384,7 @@ async fn the_first_text_takes_the_photos_from_memory_or_reads_the_same_ones() {
             scene(&server, SemanticsMode::Lazy).await.id,
         ];
         server.service.understand(&first, Some(PATIENCE)).await.expect("semantics");
-        let photos = read(&upload(), &Limits::default(), &AtomicBool::new(false)).unwrap().photos;
+        let photos = photos::read(&upload(), &Limits::default()).unwrap();
         let pixels: Vec<u8> = photos.into_iter().flat_map(|posed| posed.photo.rgb).collect();
         assert_eq!(*meaning.pixels.lock().unwrap(), pixels, "kept: {kept}");
         let folder = server.data_dir().join("scenes").join(second.as_str());

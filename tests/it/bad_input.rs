@@ -163,7 +163,7 @@ pub(crate) fn uploads() -> Vec<(&'static str, Upload, &'static str, Vec<&'static
     vec![
         ("no photos", cameras_only, "invalid_request", vec!["0 photos", "2"]),
         ("nothing at all", Upload::default(), "invalid_request", vec!["upload"]),
-        ("no cameras", photos_only, "invalid_request", vec!["no camera description"]),
+        ("no cameras", photos_only, "model_unavailable", vec!["no network finds the cameras"]),
         ("one photo", one(), "invalid_request", vec!["1 photo;", "2"]),
         ("text named .jpg", named_jpg(b"hello".repeat(9)), "photo_unreadable", vec!["0001.jpg"]),
         ("truncated JPEG", named_jpg(jpeg(900)), "photo_unreadable", vec!["cut short"]),

@@ -278,18 +278,42 @@ fn bench_says_the_time_of_a_view_and_its_error() {
 }
 
 #[test]
-fn a_folder_without_cameras_is_named_with_what_finds_them() {
+fn photos_without_cameras_get_them_and_a_file_of_them() {
     if !with_network() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
     let photos = folder.path().join("only photos");
-    ok(&["sample", "-o", text(&photos), "--photos", "2", "--size", "40x30"]);
-    std::fs::remove_file(photos.join("transforms.json")).unwrap();
+    ok(&["sample", "-o", text(&photos), "--photos", "5", "--size", "480x360"]);
+    let file = photos.join("transforms.json");
+    std::fs::remove_file(&file).unwrap();
+    let told = ok_json(&["cameras", text(&photos), "-o", text(&file)]);
+    assert_eq!(told["cameras"]["placed"].as_array().unwrap().len(), 5, "{told}");
+    let written: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    let frames = written["frames"].as_array().unwrap();
+    assert_eq!(frames.len(), 5);
+    assert_eq!(
+        (&frames[0]["w"], &frames[0]["file_path"]),
+        (&json!(480), &json!("images/0000.png"))
+    );
+    // The file is read as any other, and the photos alone give the same cameras.
     let scene = folder.path().join("x.segsplat");
+    let given = ok_json(&["reconstruct", text(&photos), "-o", text(&scene)]);
+    assert_eq!(given["report"]["cameras"]["source"], "given");
+    std::fs::remove_file(&file).unwrap();
+    let solved = ok_json(&["reconstruct", text(&photos), "-o", text(&scene)]);
+    assert_eq!(solved["report"]["cameras"]["source"], "solved");
+    let poses = |of: &Value| -> Vec<f64> {
+        let cameras = of["cameras"].as_array().unwrap().iter();
+        let poses = cameras.flat_map(|one| one["camera_to_world"].as_array().unwrap());
+        poses.map(|number| number.as_f64().unwrap()).collect()
+    };
+    let apart = poses(&given).into_iter().zip(poses(&solved)).map(|(a, b)| (a - b).abs());
+    assert!(apart.fold(0.0, f64::max) < 1e-9, "{given}\n{solved}");
+    // Too few of them.
+    std::fs::remove_dir_all(photos.join("images")).unwrap();
     let line = ["reconstruct", text(&photos), "-o", text(&scene)];
-    refused(&line, ErrorCode::InvalidRequest, &format!("{}: no transforms.json", photos.display()));
-    refused(&line, ErrorCode::InvalidRequest, "pycolmap");
+    refused(&line, ErrorCode::InvalidRequest, "no photos and no cameras");
 }
 
 #[test]

@@ -28,7 +28,7 @@ const COMMANDS: [(&str, &str); 6] = [
 const NOT_IN_GRPC: Absent = &[
     ("*.deadline_ms", "the deadline of gRPC itself"),
     ("*.wait_ms", "`semantics_wait_ms`, beside the `wait_ms` of a new scene"),
-    ("create_scene.cameras", "`cameras_json`"),
+    ("create_scene.cameras", "`cameras_json`, and `cameras_mode`"),
     ("create_scene.masks", "a `photo` of the name `masks/PHOTO.png`"),
     ("create_scene.transforms", "`transforms_json`"),
     ("pick.label", "`labels`"),
@@ -53,7 +53,6 @@ const NOT_ON_THE_COMMAND_LINE: Absent = &[
     ("create_scene.photo", "the argument"),
     ("create_scene.archive", "the argument"),
     ("create_scene.splats", "the argument"),
-    ("create_scene.cameras", "in the folder of the photos"),
     ("create_scene.masks", "in the folder of the photos"),
     ("create_scene.transforms", "in the folder of the photos"),
     ("export.format=npz", "`features`"),

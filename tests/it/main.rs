@@ -11,6 +11,7 @@ mod access;
 mod answers;
 mod asking;
 mod bad_input;
+mod cameras;
 mod captures;
 mod cli;
 mod colour_words;

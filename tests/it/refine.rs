@@ -182,7 +182,7 @@ fn what_the_network_said_is_united_again_without_some_photos() {
     let Some(engine) = engine() else { return };
     let options = SampleOptions { photos: 6, width: 64, height: 48, seed: 5 };
     let photos = sample::photos(&options).expect("the options are in range");
-    let set = PhotoSet { photos: photos.clone(), warnings: Vec::new(), read_ms: 0.0 };
+    let set = PhotoSet::given(photos.clone(), Vec::new(), 0.0);
     let stop = AtomicBool::new(false);
     let watch = Watch { progress: &|_, _| (), cancel: &stop };
     let (made, seen) = make_keeping(&engine, &set, &SceneOptions::default(), watch).expect("made");

@@ -5,6 +5,7 @@ use std::sync::atomic::AtomicBool;
 use segsplat::{
     limits::Limits,
     models::NetworkOptions,
+    photos,
     pipeline::{self, Pipeline, Reconstruction},
     render::{Kinds, RenderRequest, Renderer, compare::psnr, cpu::CpuRenderer},
     sample::{self, Room, SampleOptions},
@@ -101,7 +102,7 @@ fn the_same_photos_as_each_layout_of_captures_are_the_same_scene() {
     let made = |layout: &str| {
         let photos = captures::write(layout, &posed, &pngs);
         let upload = Upload { photos, ..Upload::default() };
-        let photos = pipeline::read(&upload, &Limits::default(), &go_on).unwrap().photos;
+        let photos = photos::read(&upload, &Limits::default()).unwrap();
         let options = SceneOptions::default();
         pipeline::reconstruct(&engine, &photos, &options, &|_, _| {}, &go_on).unwrap()
     };

@@ -93,12 +93,17 @@ def test_a_shared_file_name_never_takes_a_photo(tmp_path: Path) -> None:
     ]
 
 
-def test_photos_alone_are_told_what_finds_their_cameras(tmp_path: Path) -> None:
+def test_photos_alone_are_sent(tmp_path: Path) -> None:
     (tmp_path / "IMG_1.HEIC").touch()
-    (tmp_path / "a.png").touch()
-    with pytest.raises(FileNotFoundError, match=r"IMG_1\.HEIC: HEIC is a format.*as JPEG") as alone:
+    with pytest.raises(FileNotFoundError, match=r"IMG_1\.HEIC: HEIC is a format.*as JPEG"):
         calls.parts_of(tmp_path)
-    assert "pycolmap.incremental_mapping(" in str(alone.value)
+    (tmp_path / "b").mkdir()
+    for name in ("a.png", "b/c.jpg", "transforms.json"):
+        (tmp_path / name).touch()
+    sent = [part.name for part in calls.parts_of(tmp_path, solve=True)]
+    assert sent == ["a.png", "b/c.jpg"], "the cameras are to be solved"
+    (tmp_path / "transforms.json").unlink()
+    assert [part.name for part in calls.parts_of(tmp_path)] == sent
     with pytest.raises(FileNotFoundError, match="there is no such file or folder"):
         calls.parts_of(tmp_path / "none")
 

@@ -125,7 +125,7 @@ def test_archives_and_folders(client: Client, scene: Scene, photos: Path, tmp_pa
     twin = client.scene(archive, semantics="off")
     assert np.array_equal(twin.view(width=64).image, scene.view(width=64).image)
     twin.delete()
-    with pytest.raises(FileNotFoundError, match="no folder with files of cameras"):
+    with pytest.raises(FileNotFoundError, match="no folder with photos"):
         client.scene(tmp_path)
     # A folder whose cameras lie deeper: the server finds them.
     shutil.copytree(photos, tmp_path / "dslr")

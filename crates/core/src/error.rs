@@ -54,6 +54,9 @@ table! {
     InvalidRequest: "invalid_request", 400, 3, 2, false;
     /// A photo or archive cannot be read as what it claims to be.
     PhotoUnreadable: "photo_unreadable", 422, 3, 2, false;
+    /// The cameras of photos that came without could not be solved, or the photos do not confirm
+    /// them.
+    CamerasUnsolved: "cameras_unsolved", 422, 3, 2, false;
     /// A stated limit is exceeded; the message names limit, value and maximum.
     LimitExceeded: "limit_exceeded", 413, 3, 2, false;
     /// An idempotency key was used again with other photos or options.

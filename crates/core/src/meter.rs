@@ -45,8 +45,8 @@ pub fn register() {
 pub const NETWORK_FALLBACKS: &str = "segsplat_network_fallbacks_total";
 
 /// Names of the networks.
-const NETWORKS: [&str; 5] =
-    ["geometry network", "mask encoder", "mask decoder", "image tower", "text tower"];
+const NETWORKS: [&str; 6] =
+    ["geometry network", "mask encoder", "mask decoder", "image tower", "text tower", "features"];
 
 /// Name of the metric: time of each run of a network, copies to and from the device included, by
 /// `network`.

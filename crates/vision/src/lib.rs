@@ -1,14 +1,15 @@
-//! From posed photos to Gaussians and their semantics: every stage between an upload and a scene.
+//! From photos to Gaussians and their semantics: every stage between an upload and a scene.
 //!
 //! | layer | modules | may use |
 //! |---|---|---|
-//! | L1 stages | [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`sample`] | `segsplat_core` (and [`segsplat_render::vectorised`]); never each other |
+//! | L1 stages | [`capture`], [`models`], [`lift`], [`matching`], [`segment`], [`semantics`], [`sample`] | `segsplat_core` (and [`segsplat_render::vectorised`]); never each other |
 //! | L1 stages | [`photos`] | `segsplat_core`, `segsplat_formats`, [`capture`] (which turn of photos fits) |
 //! | L1 stages | [`refine`] | `segsplat_core`, `segsplat_render` |
-//! | L2 order | [`pipeline`] | L1; the only place that knows their order |
+//! | L2 order | [`pipeline`] | L1, `segsplat_cameras`; the only place that knows their order |
 
 pub mod capture;
 pub mod lift;
+pub mod matching;
 pub mod models;
 pub mod photos;
 pub mod pipeline;

@@ -6,8 +6,9 @@ use super::pb;
 use crate::{
     error::{Error, Result, short},
     scene::{
-        CameraToWorld, DropCount, HealthReport, Intrinsics, Refine, RefineReport, RefineState,
-        ScoringMethod, SemanticsReport, StageTime, Warning,
+        CameraToWorld, CamerasMode, CamerasReport, CamerasSource, DropCount, HealthReport,
+        Intrinsics, LeftOutPhoto, PlacedPhoto, Refine, RefineReport, RefineState, ScoringMethod,
+        SemanticsReport, StageTime, Warning,
     },
     service::{
         BackgroundSpec, Boxes, CallerLimits, CameraSpec, Density, ERROR_FAST, Event, ExportFormat,
@@ -103,6 +104,17 @@ fn report(report: HealthReport) -> pb::HealthReport {
         warnings: report.warnings.into_iter().map(warning).collect(),
         refinement: report.refinement.map(refine_report),
         file_format: report.file_format.unwrap_or_default(),
+        cameras: Some(cameras_report(report.cameras)),
+    )
+}
+
+fn cameras_report(report: CamerasReport) -> pb::CamerasReport {
+    let placed = |of: PlacedPhoto| message!(PlacedPhoto from of { file, inliers, error_px, k1 });
+    let left_out = |LeftOutPhoto { file, reason }| pb::LeftOutPhoto { file, reason };
+    message!(CamerasReport from report { confidence }
+        source: pb::CamerasSource::from(report.source).into(),
+        placed: report.placed.into_iter().map(placed).collect(),
+        left_out: report.left_out.into_iter().map(left_out).collect(),
     )
 }
 
@@ -247,6 +259,7 @@ pub(super) fn scene_options(header: &pb::CreateSceneHeader) -> Result<SceneOptio
         ($($name:ident),+) => {
             SceneOptions {
                 max_views: header.max_views.map(|views| views as usize),
+                cameras: value("cameras_mode", header.cameras_mode)?,
                 semantics: value("semantics", header.semantics)?,
                 refine: refine(&header.refine)?,
                 preset: value("preset", method.preset)?,
@@ -498,10 +511,12 @@ to_number! {
     SceneState = SceneState { Queued, Running, Done, Failed, Cancelled }
     RefineState = RefineState { None, Running, Done, Failed }
     SemanticsState = SemanticsState { Off, None, Running, Ready, Failed }
+    CamerasSource = CamerasSource { Given, Solved }
     Trust = Trust { Good, Fair, Poor, Unmeasured }
 }
 
 both_ways! {
+    CamerasMode = CamerasMode { Auto, Solve }
     SemanticsMode = Semantics { Lazy, Eager, Off }
     Density = Density { Thinned, Full }
     PictureKind = Kind { Color, Depth, Alpha, Semantics, Relevancy, Mask }

@@ -17,7 +17,7 @@ use crate::{
         upload::{UploadBuilder, UploadGuard, check_bundle},
     },
     error::{Error, ErrorCode, Result},
-    scene::{SceneId, Upload, UploadCameras},
+    scene::{CamerasMode, SceneId, Upload, UploadCameras},
     service::{
         CreateScene, Export, PageRequest, PictureKind, SceneStatus, SemanticsMode, ViewSpec,
         ViewTimes, ViewsSpec,
@@ -273,6 +273,7 @@ fn begin(
     upload: &mut UploadBuilder<'_>,
 ) -> Result<pb::CreateSceneHeader> {
     convert::value::<SemanticsMode>("semantics", header.semantics)?;
+    convert::value::<CamerasMode>("cameras_mode", header.cameras_mode)?;
     convert::refine(&header.refine)?;
     check_bundle(&header.bundle, api.service.bundle())?;
     let cameras = header.cameras.take().map(|cameras| match cameras {

@@ -47,7 +47,8 @@ pub(super) struct UploadForm {
     #[schema(content_media_type = "application/json")]
     transforms: Option<String>,
     /// Our own JSON (OpenCV axes):
-    /// `{"cameras":[{"file","intrinsics","camera_to_world"}]}`.
+    /// `{"cameras":[{"file","intrinsics","camera_to_world"}]}`; or the word `solve`, which is the
+    /// option of this name.
     #[schema(content_media_type = "application/json")]
     cameras: Option<String>,
     /// A zip or tar of a folder with a capture of any known layout (docs/captures.md), instead of
@@ -175,7 +176,21 @@ async fn parts(
         let name = field.name().unwrap_or_default().to_owned();
         match name.as_str() {
             "transforms" => upload.begin_cameras(UploadCameras::Transforms(Vec::new()))?,
-            "cameras" => upload.begin_cameras(UploadCameras::Cameras(Vec::new()))?,
+            // The option and the JSON part share a name: JSON begins with a bracket.
+            "cameras" => {
+                let first = field.chunk().await.map_err(broken)?.unwrap_or_default();
+                if first.first().is_some_and(u8::is_ascii_alphabetic) {
+                    let Some(at) = options.iter().position(|left| *left == "cameras") else {
+                        return Err(Error::invalid("upload: cameras is given twice"));
+                    };
+                    let value = text_from(first.to_vec(), &mut field).await?;
+                    fields.push(options.swap_remove(at), value);
+                    body.progressed();
+                    continue;
+                }
+                upload.begin_cameras(UploadCameras::Cameras(Vec::new()))?;
+                upload.extend(&first)?;
+            }
             "archive" => upload.begin_archive(),
             "splats" => upload.begin_splats(field.file_name().unwrap_or_default())?,
             option if all.contains(&option) => {
@@ -290,7 +305,11 @@ fn extended_name(disposition: &[u8]) -> Option<String> {
 }
 
 async fn text(field: &mut Field<'_>) -> Result<String> {
-    let mut bytes = Vec::new();
+    text_from(Vec::new(), field).await
+}
+
+/// The text of a part whose first bytes are these.
+async fn text_from(mut bytes: Vec<u8>, field: &mut Field<'_>) -> Result<String> {
     while let Some(piece) = field.chunk().await.map_err(broken)? {
         bytes.extend_from_slice(&piece);
         if bytes.len() > OPTION_BYTES_MAX {

@@ -32,7 +32,7 @@ use crate::{
     },
     keys::Caller,
     limits::Limits,
-    photos::{SentPixels, each},
+    photos::{KnownCameras, SentPixels, each},
     render::Kinds,
     scene::{Photo, Preset, Scene, SceneCamera, Upload},
 };
@@ -103,7 +103,13 @@ impl FolderPixels for Pixels<'_> {
             return Ok(());
         };
         let mut numbers = 0..;
-        each(upload, &self.limits, |sent| {
+        let meta = &self.scene.meta;
+        let known = KnownCameras {
+            mode: meta.provenance.options.cameras,
+            cameras: &meta.cameras,
+            report: &meta.report.cameras,
+        };
+        each(upload, known, &self.limits, |sent| {
             let Some(i) = numbers.next() else { return Ok(()) };
             let [w, h] = [sent.camera.intrinsics.width, sent.camera.intrinsics.height];
             // Under other limits than those of its time a scene has other photos.

@@ -570,6 +570,7 @@ pub(crate) fn messages(upload: &Upload, options: &Options) -> Vec<pb::CreateScen
             .preset
             .map(|name| pb::Method { preset: preset(Some(name)).into(), ..pb::Method::default() }),
         refine: String::new(),
+        cameras_mode: pb::CamerasMode::Unspecified.into(),
         wait_ms: options.wait_ms,
         idempotency_key: options.idempotency_key.clone().unwrap_or_default(),
     };

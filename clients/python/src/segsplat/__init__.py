@@ -1,10 +1,11 @@
-"""Client of SegSplat Server: photos with known cameras in, views, depth and text masks out.
+"""Client of SegSplat Server: photos in, views, depth and text masks out.
 
 >>> from segsplat import Client
 >>> scene = Client().scene("photos/")
 >>> scene.view(from_=0, to=1, t=0.5).save("view.png")
 
-Frames and units: the world is that of the uploaded cameras, in their units. Cameras are OpenCV: x
+Frames and units: the world is that of the uploaded cameras, in their units, or of those that the
+server found, in its own. Cameras are OpenCV: x
 right, y down, z forward. Arrays are [height, width]. The centre of the first pixel is (0.5, 0.5).
 """
 

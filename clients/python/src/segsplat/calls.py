@@ -79,17 +79,11 @@ MASKS = re.compile(r"masks?(_\d+)?", re.IGNORECASE)
 AS_JPEG = (
     "export it as JPEG (iPhone: Settings, Camera, Formats, Most Compatible; a Mac: Preview, Export)"
 )
-#: What finds the cameras of photos alone.
-FIND_CAMERAS = """for photos alone, these lines find their cameras (pip install pycolmap):
-    pycolmap.extract_features("photos/database.db", "photos/images")
-    pycolmap.match_exhaustive("photos/database.db")
-    pycolmap.incremental_mapping("photos/database.db", "photos/images", "photos/sparse")
-docs/captures.md says more"""
 NOT_READ = frozenset({"points3D", "rigs", "frames", "project"})
 DEPTHS = frozenset({"depth", "confidence", "lowres_depth", "highres_depth"})
 
-#: A folder with a capture of any layout that the server knows; an archive of one; a file of
-#: Gaussians (PLY, SPZ, SOG, GLB, .splat); or photos and their cameras.
+#: A folder with photos, or a capture of any layout that the server knows; an archive of one; a
+#: file of Gaussians (PLY, SPZ, SOG, GLB, .splat); or photos and their cameras.
 Source: TypeAlias = str | Path | Mapping[str | Path, Camera]
 #: A scene as the server shows it.
 Shown: TypeAlias = tuple[SceneStatus, tuple[Photo, ...]]
@@ -128,18 +122,22 @@ def create(
         "POST",
         "/v1/scenes",
         params={name.removesuffix("_"): value for name, value in options.items()},
-        upload=parts_of(source, policy.limits) + masks_in(masks),
+        upload=parts_of(source, policy.limits, options.get("cameras") == "solve")
+        + masks_in(masks),
         headers={"idempotency-key": idempotency_key or str(uuid4())},
     )
     answer = yield from send(policy, request)
     return parse(SceneStatus, _json(answer.body)), ()
 
 
-def parts_of(source: Source, limits: CallerLimits | None = None) -> list[Part]:
+def parts_of(
+    source: Source, limits: CallerLimits | None = None, solve: bool = False
+) -> list[Part]:
     """The parts of an upload. Photos are read while they are sent.
 
     limits: those of the server, for which photos are chosen and made smaller; None: all go as they
         are.
+    solve: whether the server finds the cameras: files of cameras in a folder are not sent.
     """
     if isinstance(source, Mapping):
         if not source:
@@ -159,18 +157,20 @@ def parts_of(source: Source, limits: CallerLimits | None = None) -> list[Part]:
         return [Part("archive", path.name, path)]
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file or folder")
-    for field in ("transforms", "cameras"):
+    for field in () if solve else ("transforms", "cameras"):
         if (path / f"{field}.json").is_file():
             return _described(path, field, limits)
     files = sorted(file for file in path.rglob("*") if _belongs(file.relative_to(path)))
     parts = [Part("photo", file.relative_to(path).as_posix(), file) for file in files]
     photos = [part for part in parts if Path(part.name).suffix.lower() in PHOTOS]
-    cameras_of = [part for part in parts if part not in photos]
-    if not cameras_of:
+    if not photos:
         raise FileNotFoundError(
-            f"{path}: no archive, no file of Gaussians and no folder with files of cameras"
-            f"{_unread(path)}; {FIND_CAMERAS}"
+            f"{path}: no archive, no file of Gaussians and no folder with photos{_unread(path)}"
         )
+    cameras_of = [part for part in parts if part not in photos and not solve]
+    if not cameras_of:
+        # The server finds them.
+        return fit(photos, limits)[0]
     # COLMAP says the size of its photos, so they may be made smaller. Not all layouts do.
     is_colmap = any(Path(part.name).name in ("cameras.bin", "cameras.txt") for part in cameras_of)
     return [*fit(photos, limits, is_colmap)[0], *cameras_of]

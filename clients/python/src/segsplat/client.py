@@ -219,11 +219,12 @@ class Client(_Connection):
         idempotency_key: str | None = None,
         **options: Unpack[SceneOptions],
     ) -> Scene:
-        """Makes a scene of photos with known cameras, and waits until it is made.
+        """Makes a scene of photos, and waits until it is made.
 
-        source: a folder with a capture: `transforms.json`, COLMAP, Polycam and others, which the
-            server recognises; a zip or tar of one; `{"photo.jpg": Camera(...)}`; or a file of
-            Gaussians (PLY, SPZ, SOG, GLB, .splat), which needs no photos.
+        source: a folder with photos, whose cameras the server finds; or with a capture:
+            `transforms.json`, COLMAP, Polycam and others, which the server recognises; a zip or
+            tar of one; `{"photo.jpg": Camera(...)}`; or a file of Gaussians
+            (PLY, SPZ, SOG, GLB, .splat), which needs no photos.
         masks: a folder with masks, each named as its photo (`0001.png` or `0001.jpg.png`): what is
             black in them takes no part in the scene. Those that a `transforms.json` names, and
             those in a folder `masks` beside COLMAP's cameras, are found without it.

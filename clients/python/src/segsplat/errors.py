@@ -11,6 +11,7 @@ __all__ = [
     "SegSplatError",
     "InvalidRequest",
     "PhotoUnreadable",
+    "CamerasUnsolved",
     "LimitExceeded",
     "IdempotencyKeyReused",
     "SceneNotFound",
@@ -97,6 +98,13 @@ class LimitExceeded(SegSplatError):
     """A stated limit is exceeded; the message names limit, value and maximum."""
 
     code = "limit_exceeded"
+
+
+class CamerasUnsolved(SegSplatError):
+    """The cameras of photos that came without could not be solved, or the photos do not confirm
+    them."""
+
+    code = "cameras_unsolved"
 
 
 class IdempotencyKeyReused(SegSplatError):

@@ -97,7 +97,11 @@ def _upload(
     method: MethodDescriptor, step: Request, fields: Mapping[str, Any]
 ) -> Iterator[Message]:
     """The header with options and cameras, then the files in pieces."""
-    enums = ("preset", "density", "mask_level", "semantics")
+    enums = ("preset", "density", "mask_level", "semantics", "cameras_mode")
+    # The header has the cameras themselves under that name.
+    if "cameras" in fields:
+        fields = {**fields, "cameras_mode": fields["cameras"]}
+        del fields["cameras"]
     fields = {name: _enum(name, v) if name in enums else v for name, v in fields.items()}
     how = {name: fields[name] for name in METHOD if name in fields}
     header = {name: value for name, value in fields.items() if name not in how}

@@ -218,6 +218,8 @@ class ExportCall(TextOptions, total=False):
 class SceneOptions(TypedDict, total=False):
     """How a scene is made."""
 
+    #: "solve" has the server find the cameras from the photos, also where the source has some.
+    cameras: Literal["auto", "solve"]
     #: When texts can be asked: "lazy" from the first one on, "eager" at once, "off" never.
     semantics: Literal["lazy", "eager", "off"]
     #: "paper" makes, understands, draws and scores the scene as the paper does. The options from
@@ -327,6 +329,44 @@ class RefineReport:
     gaussians_after: int = 0
 
 
+@dataclass(frozen=True)
+class PlacedPhoto:
+    """A photo whose camera the server found."""
+
+    #: File name.
+    file: str
+    #: Keypoints that agree with the points of the scene.
+    inliers: int
+    #: Root of the mean squared distance of these to their points, pixels of the photo.
+    error_px: float
+    #: Radial distortion that was taken out of the photo: k1 of OpenCV's model.
+    k1: float
+
+
+@dataclass(frozen=True)
+class LeftOutPhoto:
+    """A photo whose camera the server did not find."""
+
+    #: File name.
+    file: str
+    #: Why, a sentence.
+    reason: str
+
+
+@dataclass(frozen=True)
+class CamerasReport:
+    """What is known of the cameras of a scene."""
+
+    #: Whether they came with the photos, or were computed from them.
+    source: Literal["given", "solved"] = "given"
+    #: How likely solved cameras are right, 0 to 1; None of given ones.
+    confidence: float | None = None
+    #: Solved cameras: their photos, in the order of the scene's cameras.
+    placed: tuple[PlacedPhoto, ...] = ()
+    #: Photos that are no part of the scene.
+    left_out: tuple[LeftOutPhoto, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class Report:
     """How the making of a scene went."""
@@ -357,6 +397,8 @@ class Report:
     dropped: tuple[DropCount, ...] = ()
     #: What refinement made of it; None where it was not refined.
     refinement: RefineReport | None = None
+    #: Where the cameras come from.
+    cameras: CamerasReport = CamerasReport()
 
 
 @dataclass(frozen=True)

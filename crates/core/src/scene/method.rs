@@ -10,7 +10,7 @@ use crate::{
     error::{Error, Result},
     limits::{BANK_ROWS_MAX, CANON_MAX, LAMBDA_RANGE, SCENE_PHOTOS_MAX, TAU_RANGE},
     names::display_names,
-    scene::Refine,
+    scene::{CamerasMode, Refine},
 };
 
 /// When the semantics of a scene are made.
@@ -112,6 +112,10 @@ macro_rules! method {
         pub struct SceneOptions {
             /// Views the network takes at once, 4 by default where the bundle takes as many.
             pub max_views: Option<usize>,
+            /// Whether the cameras of the upload are used: `auto` (default) those that it has, solved
+            /// where it has none; `solve` computes them from the photos in any case.
+            #[param(inline)]
+            pub cameras: CamerasMode,
             /// When a scene's semantics are made: `lazy` (default) with the first text, `eager` as
             /// soon as it can be viewed, `off` never.
             #[param(inline)]
@@ -136,7 +140,7 @@ macro_rules! method {
         impl SceneOptions {
             /// Names of all options.
             pub const NAMES: &[&str] =
-                &["max_views", "semantics", "refine", "preset", $(stringify!($name),)+];
+                &["max_views", "cameras", "semantics", "refine", "preset", $(stringify!($name),)+];
 
             /// The method that these options spell.
             pub fn method(&self) -> Method {

@@ -5,6 +5,7 @@
 mod axes;
 mod backdrop;
 mod camera;
+mod cameras;
 mod capture;
 mod failure;
 mod finished;
@@ -24,6 +25,9 @@ mod weights;
 pub use axes::{covariance, principal_axes};
 pub use backdrop::Backdrop;
 pub use camera::{Camera, CameraToWorld, Intrinsics, ORTHONORMAL_TOLERANCE, Region};
+pub use cameras::{
+    CamerasMode, CamerasReport, CamerasSource, LeftOutPhoto, PlacedPhoto, SolvedCamera,
+};
 pub use capture::{Capture, ViewSet};
 pub use failure::SceneError;
 pub use finished::{PhotoHash, Provenance, Scene, SceneMeta};
@@ -33,7 +37,7 @@ pub use id::{SCENE_ID_CHARS, SceneId};
 pub use method::{
     Density, MaskLevel, Method, Preset, SceneOptions, ScoringMethod, SemanticsMode, with_pairs,
 };
-pub use photo::{Crop, CropShape, Photo, PosedPhoto, photo_label};
+pub use photo::{Crop, CropShape, Photo, PosedPhoto, UnposedPhoto, photo_label};
 pub use refinement::{Refine, RefineReport, RefineState, RefineStatus};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{

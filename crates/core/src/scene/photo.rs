@@ -1,4 +1,4 @@
-//! Photos with known cameras. Their lens distortion is already undone.
+//! Photos with known cameras, whose lens distortion is already undone, and photos without.
 
 use serde::Deserialize;
 
@@ -54,6 +54,19 @@ pub struct PosedPhoto {
     /// Width and height that the uploaded intrinsics were made for, where these are not the
     /// photo's: `camera` was scaled to the photo, and the capture report says so.
     pub intrinsics_made_for: Option<[u32; 2]>,
+}
+
+/// A photo whose camera is not known, upright, and the file it came from.
+#[derive(Clone, Debug)]
+pub struct UnposedPhoto {
+    /// File name as uploaded.
+    pub file: String,
+    /// Pixels.
+    pub photo: Photo,
+    /// Width and height of the file's picture, upright: `photo` may be smaller.
+    pub file_size: [u32; 2],
+    /// Focal length in pixels, as the photo's EXIF gives it: some per cent off.
+    pub focal: Option<f64>,
 }
 
 /// How a photo is called in messages: `photo 3 ("images/0003.jpg")`.

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use crate::scene::{Method, RefineReport};
+use crate::scene::{CamerasReport, Method, RefineReport};
 
 /// What looks wrong with a capture; the scene was made all the same.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
@@ -48,6 +48,8 @@ pub enum WarningCode {
     PosesScaled,
     /// A lens that leaves most of a photo without a source, or that seems to be undone already.
     LensDoubtful,
+    /// Cameras that were solved and may be wrong in part.
+    CamerasDoubtful,
 }
 
 crate::names::display_names!(WarningCode);
@@ -98,6 +100,10 @@ pub struct HealthReport {
     #[serde(default)]
     #[schema(required = true)]
     pub method: Method,
+    /// Where the cameras come from.
+    #[serde(default)]
+    #[schema(required = true)]
+    pub cameras: CamerasReport,
     /// Photos used.
     pub views_used: u32,
     /// Gaussians kept.

@@ -12,6 +12,8 @@ use crate::error::{Error, ErrorCode, Result};
 pub enum Stage {
     /// The upload is read: undistorted photos with cameras, or the Gaussians of a file.
     Photos,
+    /// The cameras of photos that came without.
+    Cameras,
     /// Depth ranges, overlap and diagnosis from the photos themselves.
     Capture,
     /// The geometry network.
@@ -34,8 +36,8 @@ pub enum Stage {
 
 impl Stage {
     /// Stages of a scene, in order.
-    pub const SCENE: [Self; 5] =
-        [Self::Photos, Self::Capture, Self::Geometry, Self::Lift, Self::Store];
+    pub const SCENE: [Self; 6] =
+        [Self::Photos, Self::Cameras, Self::Capture, Self::Geometry, Self::Lift, Self::Store];
 
     /// Stages of the semantics of a scene, in order.
     pub const SEMANTICS: [Self; 4] = [Self::Masks, Self::Embed, Self::Bank, Self::Assign];
@@ -55,8 +57,9 @@ impl Stage {
     const fn row(self) -> (&'static str, [f32; 2]) {
         match self {
             Self::Photos => ("photos", [0.0, 0.1]),
-            Self::Capture => ("capture", [0.1, 0.2]),
-            Self::Geometry => ("geometry", [0.2, 0.9]),
+            Self::Cameras => ("cameras", [0.1, 0.25]),
+            Self::Capture => ("capture", [0.25, 0.3]),
+            Self::Geometry => ("geometry", [0.3, 0.9]),
             Self::Lift => ("lift", [0.9, 0.97]),
             Self::Store => ("store", [0.97, 1.0]),
             Self::Masks => ("masks", [0.0, 0.6]),

@@ -154,7 +154,8 @@ pub struct SceneStatus {
     pub id: SceneId,
     /// State.
     pub state: SceneState,
-    /// Stage at work while running: `photos`, `capture`, `geometry`, `lift`, `store`.
+    /// Stage at work while running: `photos`, `cameras` where they are solved, `capture`,
+    /// `geometry`, `lift`, `store`.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub stage: Option<String>,
     /// Share of the whole work that is done, 0..1.

@@ -108,6 +108,12 @@ impl Base {
 }
 
 impl Terms {
+    /// The first radial term alone, of OpenCV's model.
+    #[must_use]
+    pub fn of_k1(k1: f64) -> Self {
+        Self { k: [k1, 0.0, 0.0, 0.0, 0.0, 0.0], ..Self::default() }
+    }
+
     /// Whether it leaves every ray where it is.
     fn is_none(&self) -> bool {
         *self == Self::default()

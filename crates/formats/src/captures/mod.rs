@@ -23,6 +23,7 @@ pub(crate) mod names;
 mod numbers;
 mod once;
 mod places;
+mod unposed;
 
 use std::{
     borrow::Cow,
@@ -32,9 +33,11 @@ use std::{
 
 use glam::DVec3;
 
+pub use self::layouts::FIND_CAMERAS;
 pub use self::lens::{Base, Lens, LensAtSize, Sizes, Terms, same_aspect};
 pub use self::masks::FoundMask;
 pub use self::names::decoded as decoded_name;
+pub use self::unposed::{FoundUnposed, UnposedFile, find_unposed, find_unposed_in_dir};
 use self::{
     cameras::{CameraEntry, Cameras},
     candidates::{Best, Candidate, Pair, paired},

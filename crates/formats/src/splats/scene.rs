@@ -13,8 +13,9 @@ use crate::{
     error::{Error, Result},
     limits::BANK_ROWS_MAX,
     scene::{
-        Backdrop, Camera, CameraToWorld, DropCount, Gaussians, HealthReport, Intrinsics,
-        Provenance, Refine, Scene, SceneCamera, SceneId, SceneMeta, SceneOptions, SemanticsMode,
+        Backdrop, Camera, CameraToWorld, CamerasMode, DropCount, Gaussians, HealthReport,
+        Intrinsics, Provenance, Refine, Scene, SceneCamera, SceneId, SceneMeta, SceneOptions,
+        SemanticsMode,
     },
 };
 
@@ -97,6 +98,7 @@ fn check_options(format: &SplatFormat, options: &SceneOptions, has_semantics: bo
     let eager = options.semantics == SemanticsMode::Eager && !has_semantics;
     let wrong = match options {
         SceneOptions { max_views: Some(_), .. } => "max_views",
+        SceneOptions { cameras: CamerasMode::Solve, .. } => "cameras",
         SceneOptions { density: Some(_), .. } => "density",
         SceneOptions { refine: Some(Refine::Ms(_)), .. } => "refine",
         _ if eager => "semantics=eager",

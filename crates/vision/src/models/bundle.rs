@@ -18,8 +18,8 @@ use crate::{
     models::{
         NetworkOptions, SETUP_COMMAND,
         manifest::{
-            Faults, GeometryManifest, ImageTextManifest, MANIFEST, MasksManifest, is_plain,
-            unavailable,
+            Faults, FeaturesManifest, GeometryManifest, ImageTextManifest, MANIFEST, MasksManifest,
+            is_plain, unavailable,
         },
         onnx::OnnxHeader,
         places,
@@ -56,6 +56,7 @@ struct BundleManifest {
     geometry: GeometryManifest,
     masks: Option<MasksManifest>,
     image_text: Option<ImageTextManifest>,
+    features: Option<FeaturesManifest>,
 }
 
 /// The keys of weights beside a network, `data` and `data_sha256`.
@@ -66,8 +67,8 @@ type Data<'a> = [&'a Option<String>; 2];
 pub struct BundleFile<'a> {
     /// What it is for: `geometry`, `geometry.cpu`, `geometry.many`, `geometry.many.cpu`,
     /// `masks.encoder`, `masks.decoder`, `image_text.image`, `image_text.text`,
-    /// `image_text.tokenizer`, `image_text.words`. A file of weights beside another has that one's
-    /// name.
+    /// `image_text.tokenizer`, `image_text.words`, `features`. A file of weights beside
+    /// another has that one's name.
     pub part: &'static str,
     /// Name in the bundle's folder.
     pub file: &'a str,
@@ -148,6 +149,9 @@ impl Bundle {
         }
         if let Some(image_text) = &manifest.image_text {
             image_text.validate(&mut faults);
+        }
+        if let Some(features) = &manifest.features {
+            features.validate(&mut faults);
         }
         let sha256 = hex(&Sha256::digest(&text));
         let bundle = Self { dir: dir.to_owned(), sha256, manifest, words: Arc::default() };
@@ -244,6 +248,12 @@ impl Bundle {
         self.manifest.image_text.as_ref()
     }
 
+    /// The feature network's entry; `None`: it takes no photos without cameras.
+    #[must_use]
+    pub fn features(&self) -> Option<&FeaturesManifest> {
+        self.manifest.features.as_ref()
+    }
+
     /// What it lacks for semantics; `None` where nothing.
     #[must_use]
     pub fn lacks_semantics(&self) -> Option<&'static str> {
@@ -258,7 +268,7 @@ impl Bundle {
     /// Every file that the manifest names, itself left out.
     #[must_use]
     pub fn files<'a>(&'a self) -> Vec<BundleFile<'a>> {
-        let BundleManifest { geometry, masks, image_text, .. } = &self.manifest;
+        let BundleManifest { geometry, masks, image_text, features, .. } = &self.manifest;
         let mut files = Vec::new();
         let mut network = |part, licence, [file, sha256]: [&'a str; 2], data: Data<'a>| {
             files.push(BundleFile { part, file, sha256, licence });
@@ -291,6 +301,9 @@ impl Bundle {
             if let Some(words) = &image_text.words {
                 network("image_text.words", licence, [&words.file, &words.sha256], [&None, &None]);
             }
+        }
+        if let Some(f) = features {
+            network("features", &f.licence, [&f.file, &f.sha256], [&f.data, &f.data_sha256]);
         }
         files
     }

@@ -6,8 +6,8 @@ use std::{path::Path, time::Instant};
 use crate::{
     error::Result,
     models::{
-        Bundle, Geometry, ImageText, MaskNetwork, NetworkOptions, ProviderChoice, Runtime,
-        geometry, image_text, masks,
+        Bundle, FeatureNetwork, Geometry, ImageText, MaskNetwork, NetworkOptions, ProviderChoice,
+        Runtime, features, geometry, image_text, masks,
         network::{self, Signature},
     },
 };
@@ -101,6 +101,14 @@ pub fn check(dir: &Path, options: &NetworkOptions) -> Result<BundleCheck> {
                 timed(
                     || ImageText::open(runtime, &bundle, options),
                     |of| of.as_ref().map_or(Ok(()), ImageText::try_out),
+                )
+            });
+        }
+        if let Some(manifest) = bundle.features() {
+            run("features", &features::signatures(manifest), &|| {
+                timed(
+                    || FeatureNetwork::open(runtime, &bundle, options),
+                    |of| of.as_ref().map_or(Ok(()), FeatureNetwork::try_out),
                 )
             });
         }

@@ -1,5 +1,6 @@
 //! The sections of `bundle.toml`: the geometry network, the mask network, the image and text
-//! towers. `models/README.md` lists every key. A bundle without the last two has no semantics.
+//! towers, the feature network. `models/README.md` lists every key. A bundle without the second and
+//! third has no semantics; one without the last takes no photos without cameras.
 
 use std::{
     fmt::{Debug, Display},
@@ -38,6 +39,8 @@ const WEIGHTS_MAX: usize = 16;
 const WEIGHT_MAX: f64 = 100.0;
 /// Numbers of one embedding.
 const DIM_MAX: usize = 4_096;
+/// Keypoints of a photo: two photos are compared each with each.
+const KEYPOINTS_MAX: usize = 8_192;
 /// Tokens of one text.
 const CONTEXT_MAX: usize = 1_024;
 
@@ -501,13 +504,7 @@ impl DenseManifest {
     /// Width and height at which a photo of `[width, height]` pixels goes in.
     #[must_use]
     pub fn fitted(&self, photo: [u32; 2]) -> [u32; 2] {
-        let longer = f64::from(photo[0].max(photo[1]).max(1));
-        photo.map(|side| {
-            let cells = f64::from(side) / longer * f64::from(self.side) / f64::from(self.cell);
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "few")]
-            let cells = cells.round_ties_even().max(1.0) as u32;
-            cells * self.cell
-        })
+        in_cells(photo, self.side, self.cell)
     }
 
     fn validate(&self, faults: &mut Faults) {
@@ -560,6 +557,80 @@ pub struct TextTowerManifest {
     pub attention_mask: Option<String>,
     /// Output: `[B, dim]` f32, of any length.
     pub output: String,
+}
+
+/// The feature network in `bundle.toml`.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FeaturesManifest {
+    /// File in the bundle's folder.
+    pub file: String,
+    /// Its sha256, hex.
+    pub sha256: String,
+    /// File of the weights that are not in `file`.
+    pub data: Option<String>,
+    /// Its sha256, hex.
+    pub data_sha256: Option<String>,
+    /// Licence of the weights.
+    pub licence: String,
+    /// Where the weights come from.
+    pub source: String,
+    /// Input: `[1, 3, H, W]` f32.
+    pub input: String,
+    /// Output: `[N, 2]` f32, x and y in pixels of the input, best first; the centre of the top left
+    /// pixel is (0.5, 0.5).
+    pub keypoints: String,
+    /// Output: `[N]` f32, how good each is.
+    pub scores: String,
+    /// Output: `[N, dim]` f32, of length 1.
+    pub descriptors: String,
+    /// Longer side of a photo, pixels.
+    pub side: u32,
+    /// Both sides of a photo are whole multiples of this, pixels.
+    pub cell: u32,
+    /// Numbers of a descriptor.
+    pub dim: usize,
+    /// Most keypoints of a photo.
+    pub count: usize,
+    /// Two keypoints match only where the cosine of their descriptors is over this.
+    pub similarity_min: f32,
+    /// Filter that brings a photo to that size.
+    #[serde(default)]
+    pub resize: ResizeFilter,
+    /// Subtracted from the 0..1 channels.
+    pub mean: [f32; 3],
+    /// Divides them after that.
+    pub std: [f32; 3],
+}
+
+impl FeaturesManifest {
+    /// Width and height at which a photo of `[width, height]` pixels goes in.
+    #[must_use]
+    pub fn fitted(&self, photo: [u32; 2]) -> [u32; 2] {
+        in_cells(photo, self.side, self.cell)
+    }
+
+    pub(super) fn validate(&self, faults: &mut Faults) {
+        faults.file("features", &self.file, &self.sha256);
+        faults.data("features", &self.data, &self.data_sha256);
+        faults.range("features.cell", self.cell, 1..=BUCKET_SIDE_MAX);
+        faults.range("features.side", self.side, self.cell.max(1)..=BUCKET_SIDE_MAX);
+        faults.range("features.dim", self.dim, 1..=DIM_MAX);
+        faults.range("features.count", self.count, 1..=KEYPOINTS_MAX);
+        faults.range("features.similarity_min", self.similarity_min, -1.0..=1.0);
+        faults.channels("features", self.mean, self.std);
+    }
+}
+
+/// Width and height of a photo whose longer side becomes `side`, both whole multiples of `cell`.
+fn in_cells(photo: [u32; 2], side: u32, cell: u32) -> [u32; 2] {
+    let longer = f64::from(photo[0].max(photo[1]).max(1));
+    photo.map(|length| {
+        let cells = f64::from(length) / longer * f64::from(side) / f64::from(cell);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "few")]
+        let cells = cells.round_ties_even().max(1.0) as u32;
+        cells * cell
+    })
 }
 
 /// Declares a function for each default value, as serde wants them.

@@ -2,7 +2,7 @@
 //!
 //! [`Geometry`]: photos with cameras, depth ranges and neighbours to [`ViewGaussians`].
 //! [`MaskNetwork`]: a photo and points in it to masks. [`ImageText`]: crops and texts to embeddings
-//! of one space. A network is known only by its `bundle.toml`: names, sizes, normalisation and
+//! of one space. [`FeatureNetwork`]: a photo to keypoints and descriptors. A network is known only by its `bundle.toml`: names, sizes, normalisation and
 //! frames all come from there. The only module that knows `ort`.
 //!
 //! [`ViewGaussians`]: crate::scene::ViewGaussians
@@ -10,6 +10,7 @@
 mod bundle;
 mod check;
 mod correlate;
+mod features;
 mod fit;
 mod frame;
 mod geometry;
@@ -26,14 +27,15 @@ mod tensors;
 
 pub use bundle::{Bundle, BundleFile};
 pub use check::{BundleCheck, CheckedFile, check};
+pub use features::{FeatureNetwork, PhotoFeatures};
 pub use fit::{FittedPhoto, bucket_for, fit};
 pub use frame::ModelFrame;
 pub use geometry::{Geometry, GeometryInput};
 pub use image_text::{ImageText, PreparedCrops};
 pub use manifest::{
-    DenseManifest, GeometryManifest, GeometryWeights, ImageTextManifest, ImageTowerManifest,
-    MaskAdapter, MaskDecoderManifest, MaskEncoderManifest, MasksManifest, OutputFrame, PlainFile,
-    TextTowerManifest, Translation,
+    DenseManifest, FeaturesManifest, GeometryManifest, GeometryWeights, ImageTextManifest,
+    ImageTowerManifest, MaskAdapter, MaskDecoderManifest, MaskEncoderManifest, MasksManifest,
+    OutputFrame, PlainFile, TextTowerManifest, Translation,
 };
 pub use masks::{MaskNetwork, PhotoEmbedding};
 pub use network::Network;

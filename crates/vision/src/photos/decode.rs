@@ -7,7 +7,7 @@ use image::{
     DynamicImage, ImageDecoder, ImageFormat, ImageReader, imageops, metadata::Orientation,
 };
 
-use super::kinds;
+use super::{exif, kinds};
 use crate::{
     error::{Error, Result},
     limits::Limits,
@@ -141,6 +141,21 @@ pub(super) fn header(bytes: &[u8], what: &str, limits: &Limits) -> Result<Header
     Ok(Header { format, width, height, orientation, reduction })
 }
 
+/// Focal length of the EXIF of a photo, pixels of a picture of this size.
+pub(super) fn focal(bytes: &[u8], header: &Header, size: [u32; 2]) -> Option<f64> {
+    let exif = match header.format {
+        ImageFormat::Png => png_exif(bytes)?.to_vec(),
+        // Their decoders take limits of memory that a header needs none of.
+        ImageFormat::Jpeg | ImageFormat::WebP | ImageFormat::Tiff => {
+            let mut decoder =
+                ImageReader::with_format(Cursor::new(bytes), header.format).into_decoder().ok()?;
+            decoder.exif_metadata().ok()??
+        }
+        _ => return None,
+    };
+    exif::focal(&exif, size)
+}
+
 /// Width and height of a PNG's first chunk.
 fn png_size(bytes: &[u8], format: ImageFormat) -> Option<(u32, u32)> {
     if format != ImageFormat::Png || bytes.get(12..16) != Some(b"IHDR") {
@@ -152,12 +167,17 @@ fn png_size(bytes: &[u8], format: ImageFormat) -> Option<(u32, u32)> {
 
 /// How a PNG's EXIF chunk says that it is to be turned.
 fn png_orientation(bytes: &[u8]) -> Option<Orientation> {
+    Orientation::from_exif_chunk(png_exif(bytes)?)
+}
+
+/// A PNG's EXIF chunk.
+fn png_exif(bytes: &[u8]) -> Option<&[u8]> {
     let mut rest = bytes.get(8..)?;
     loop {
         let (length, named) = rest.split_first_chunk::<4>()?;
         let end = (u32::from_be_bytes(*length) as usize).saturating_add(12);
         if named.starts_with(b"eXIf") {
-            return Orientation::from_exif_chunk(rest.get(8..end - 4)?);
+            return rest.get(8..end - 4);
         }
         rest = rest.get(end..)?;
     }

@@ -6,31 +6,40 @@
 //! mask leaves out is not valid.
 
 mod decode;
+mod exif;
 mod kinds;
 mod mask;
+mod room;
 mod turns;
 mod undistort;
+mod unposed;
 
-use std::{collections::BTreeMap, ops::Range, path::Path, sync::atomic::AtomicBool};
+use std::{collections::BTreeMap, path::Path, sync::atomic::AtomicBool};
 
 use image::metadata::Orientation;
 use rayon::prelude::*;
 
+pub use self::unposed::{ReadUnposed, posed};
 use self::{
     decode::Header,
+    room::{decoded_together, side_kept},
     turns::{SIDE_COMPARED, Way},
 };
 pub use crate::scene::{Upload, UploadCameras, UploadFile};
 use crate::{
     error::{Result, short},
-    formats::captures::{FoundPhoto, FoundPhotos, LensAtSize, find, find_in_dir},
+    formats::captures::{
+        FoundPhoto, FoundPhotos, FoundUnposed, LensAtSize, find, find_in_dir, find_unposed,
+        find_unposed_in_dir,
+    },
     limits::Limits,
     photo_label as label,
-    scene::{Camera, Photo, PosedPhoto, Warning, WarningCode, unless_cancelled},
+    scene::{
+        Camera, CamerasMode, CamerasReport, Photo, PosedPhoto, SceneCamera, SolvedCamera, Warning,
+        WarningCode, unless_cancelled,
+    },
 };
 
-/// Photos of the largest size that are decoded at the same time, some 7 bytes a pixel each.
-const DECODED_TOGETHER: u64 = 2;
 /// Share of a photo that undoing a lens may leave without source.
 const LENS_TAKES_MAX: f64 = 0.5;
 
@@ -91,6 +100,51 @@ pub fn read_dir_until(
     let masks = masks.into_iter().map(|(name, bytes)| UploadFile { name, bytes });
     photos.extend(cameras.into_iter().chain(masks));
     Ok((read, Upload { photos, ..Upload::default() }))
+}
+
+/// The photos of an upload whose cameras are to be solved; `None` where it has cameras that count.
+///
+/// # Errors
+/// As [`read`]; `cancelled`.
+pub fn read_unposed(
+    upload: &Upload,
+    mode: CamerasMode,
+    limits: &Limits,
+    cancel: &AtomicBool,
+) -> Result<Option<ReadUnposed>> {
+    let found = find_unposed(upload, mode, limits)?;
+    found.map(|found| unposed::decoded(&found, limits, cancel)).transpose()
+}
+
+/// As [`read_unposed`], of a folder; also the files that were read as an upload.
+///
+/// # Errors
+/// As there.
+pub fn read_unposed_dir(
+    dir: &Path,
+    mode: CamerasMode,
+    limits: &Limits,
+    cancel: &AtomicBool,
+) -> Result<Option<(ReadUnposed, Upload)>> {
+    let Some(found) = find_unposed_in_dir(dir, mode, limits)? else { return Ok(None) };
+    let read = unposed::decoded(&found, limits, cancel)?;
+    let mut masks = BTreeMap::new();
+    let mut photos = Vec::with_capacity(found.photos.len());
+    for file in found.photos {
+        photos.push(UploadFile { name: file.name, bytes: file.bytes.into_owned() });
+        masks.extend(file.mask.map(|mask| (mask.path, mask.bytes.into_owned())));
+    }
+    photos.extend(masks.into_iter().map(|(name, bytes)| UploadFile { name, bytes }));
+    Ok(Some((read, Upload { photos, ..Upload::default() })))
+}
+
+/// The solved cameras of a scene by the files of their photos, as its record has them.
+pub fn solved<'s>(
+    cameras: &'s [SceneCamera],
+    report: &'s CamerasReport,
+) -> impl Iterator<Item = (&'s str, SolvedCamera)> {
+    let k1 = |file: &str| report.placed.iter().find(|one| one.file == file).map_or(0.0, |p| p.k1);
+    cameras.iter().map(move |of| (&*of.file, SolvedCamera { camera: of.camera, k1: k1(&of.file) }))
 }
 
 /// A photo whose header is read, and whose pixels are not.
@@ -274,16 +328,31 @@ pub enum SentPixels<'a> {
     Made(Photo),
 }
 
+/// The cameras of a scene whose photos are handed on.
+#[derive(Clone, Copy, Debug)]
+pub struct KnownCameras<'s> {
+    /// Whether the cameras of the upload were used.
+    pub mode: CamerasMode,
+    /// The cameras of the scene.
+    pub cameras: &'s [SceneCamera],
+    /// What is known of them.
+    pub report: &'s CamerasReport,
+}
+
 /// Hands on the photos of an upload in the order of the cameras, one at a time. What need not be
-/// decoded is not.
+/// decoded is not. Photos that came without cameras have those of `known`.
 ///
 /// # Errors
 /// As [`read`], and those of `see`.
 pub fn each(
     upload: &Upload,
+    known: KnownCameras<'_>,
     limits: &Limits,
     mut see: impl FnMut(SentPhoto<'_>) -> Result<()>,
 ) -> Result<()> {
+    if let Some(found) = find_unposed(upload, known.mode, limits)? {
+        return each_solved(&found, known, limits, see);
+    }
     let found = find(upload, limits)?;
     let all = AllUndecoded::new(&found, limits, &AtomicBool::new(false))?;
     for one in &all.photos {
@@ -295,6 +364,23 @@ pub fn each(
             let (PosedPhoto { photo, camera, .. }, _) = one.read(all.side_max, limits)?;
             see(SentPhoto { file, camera, pixels: SentPixels::Made(photo) })?;
         }
+    }
+    Ok(())
+}
+
+/// The photos of solved cameras, in the order of these.
+fn each_solved(
+    found: &FoundUnposed<'_>,
+    known: KnownCameras<'_>,
+    limits: &Limits,
+    mut see: impl FnMut(SentPhoto<'_>) -> Result<()>,
+) -> Result<()> {
+    let all = unposed::Undecoded::all(found, limits)?;
+    let side_max = unposed::side_of(&all, limits);
+    for (name, solved) in solved(known.cameras, known.report) {
+        let Some(one) = all.iter().find(|one| one.file.name == name) else { continue };
+        let made = posed(one.read(side_max, limits)?, &solved);
+        see(SentPhoto { file: name, camera: made.camera, pixels: SentPixels::Made(made.photo) })?;
     }
     Ok(())
 }
@@ -358,78 +444,4 @@ fn bent_away(photos: &[Undecoded<'_, '_>], taken: &[[f64; 2]]) -> Option<Warning
         photos.len()
     );
     Some(Warning { code: WarningCode::LensDoubtful, message, value: *share })
-}
-
-/// Longer side at which the photos of a scene are kept, so that all of them fit the limits.
-fn side_kept(sizes: &[[u32; 2]], limits: &Limits) -> u32 {
-    let side_max = f64::from(limits.photo_side_kept_max);
-    let pixels = |side: f64| -> f64 {
-        let of = |&[w, h]: &[u32; 2]| {
-            let share = (side / f64::from(w.max(h))).min(1.0);
-            f64::from(w) * f64::from(h) * share * share
-        };
-        sizes.iter().map(of).sum()
-    };
-    let most = limits.photos_pixels_kept_max as f64;
-    let (mut fits, mut over) = (1.0, side_max);
-    if pixels(side_max) <= most {
-        return limits.photo_side_kept_max;
-    }
-    // Photos of one scene may differ in size, so no formula gives it.
-    while over - fits >= 1.0 {
-        let middle = 0.5 * (fits + over);
-        if pixels(middle) <= most { fits = middle } else { over = middle }
-    }
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "1 to a u32")]
-    let side = fits as u32;
-    side
-}
-
-/// Photos one after another in groups that are decoded side by side, by their pixels: those of a
-/// group are at most [`DECODED_TOGETHER`] of the largest photos that may come.
-fn decoded_together(sizes: &[u64], photo_pixels_max: u64) -> Vec<Range<usize>> {
-    let (mut groups, mut begun, mut pixels): (Vec<Range<usize>>, usize, u64) = (Vec::new(), 0, 0);
-    for (i, own) in sizes.iter().enumerate() {
-        if i > begun && pixels + own > DECODED_TOGETHER.saturating_mul(photo_pixels_max) {
-            groups.push(begun..i);
-            (begun, pixels) = (i, 0);
-        }
-        pixels += own;
-    }
-    groups.push(begun..sizes.len());
-    groups
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn photos_of_a_scene_are_reduced_alike_until_they_fit() {
-        let limits = Limits::default();
-        let kept = |sizes: &[[u32; 2]]| side_kept(sizes, &limits);
-        assert_eq!(kept(&[[6_000, 4_000]; 16]), 2_048, "sixteen fit");
-        assert_eq!(kept(&[[640, 480]; 64]), 2_048, "and small ones stay as they are");
-        for sizes in
-            [vec![[6_000, 4_000]; 64], [vec![[4_000, 6_000]; 60], vec![[9, 9]; 4]].concat()]
-        {
-            let side = f64::from(kept(&sizes));
-            let pixels = |side: f64| -> f64 {
-                let share = |[w, h]: &[u32; 2]| (side / f64::from(*w.max(h))).min(1.0);
-                sizes.iter().map(|s| f64::from(s[0] * s[1]) * share(s).powi(2)).sum()
-            };
-            let most = limits.photos_pixels_kept_max as f64;
-            assert!(pixels(side) <= most && pixels(side + 2.0) > most, "{side}");
-        }
-        let tight = Limits { photos_pixels_kept_max: 0, ..limits };
-        assert_eq!(side_kept(&[[600, 400]; 3], &tight), 1, "never 0");
-    }
-
-    #[test]
-    fn no_more_than_two_of_the_largest_photos_are_decoded_together() {
-        let groups = |sizes: &[u64]| decoded_together(sizes, 100);
-        assert_eq!(groups(&[100; 5]), [0..2, 2..4, 4..5]);
-        assert_eq!(groups(&[25; 9]), [0..8, 8..9], "small ones side by side");
-        assert_eq!(groups(&[900, 1]), [0..1, 1..2], "one over the bound goes alone");
-    }
 }

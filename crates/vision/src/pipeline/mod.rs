@@ -1,16 +1,21 @@
-//! Runs the stages of [`Stage`]: photos ▸ capture ▸ geometry ▸ lift ▸ store.
+//! Runs the stages of [`Stage`]: photos ▸ cameras ▸ capture ▸ geometry ▸ lift ▸ store.
 //!
 //! [`Pipeline`] holds what is opened once (library, bundle, sessions). [`read`] makes photos of an
-//! upload, [`reconstruct`] makes Gaussians of photos, and the caller stores the scene, which is the
-//! stage [`Stage::Store`]. [`semantics`] makes the semantics of a scene.
+//! upload, [`cameras::posed`] finds their cameras where they have none, [`reconstruct`] makes
+//! Gaussians of photos, and the caller stores the scene, which is the stage [`Stage::Store`]. [`semantics`] makes the semantics of a scene.
 
+pub mod cameras;
 mod loader;
 pub mod masks;
 mod networks;
 pub mod refinement;
 pub mod semantics;
+mod sets;
 
-pub use self::loader::PipelineLoader;
+pub use self::{
+    loader::PipelineLoader,
+    sets::{PhotoSet, ReadSet, UnposedSet},
+};
 
 use std::{
     path::Path,
@@ -25,16 +30,17 @@ use crate::{
     limits::Limits,
     meter,
     models::{Bundle, Geometry, GeometryInput, Network, NetworkOptions, Provider, Runtime},
-    photos::{self, ReadPhotos},
+    photos::{self, ReadPhotos, ReadUnposed},
     refine::split,
     scene::{
-        Backdrop, Camera, Capture, Density, Gaussians, HealthReport, Intrinsics, Method, Photo,
-        PosedPhoto, Provenance, Scene, SceneCamera, SceneId, SceneMeta, SceneOptions, Stage,
-        StageTime, Upload, ViewGaussians, ViewSet, Warning, Watch, unless_cancelled,
+        Backdrop, Camera, CamerasMode, CamerasReport, Capture, Density, Gaussians, HealthReport,
+        Intrinsics, Method, PosedPhoto, Provenance, Scene, SceneCamera, SceneId, SceneMeta,
+        SceneOptions, Stage, StageTime, Upload, ViewGaussians, ViewSet, Warning, Watch,
+        unless_cancelled,
     },
 };
 
-/// Parts of a bundle that are networks of their own, where it has them.
+/// Parts of a bundle that are networks of their own, where it has them, and that callers may run.
 pub const NETWORKS: [&str; 6] = [
     "geometry",
     "geometry.many",
@@ -55,7 +61,7 @@ pub struct Pipeline {
     bundle: Bundle,
     geometry: Geometry,
     workers: rayon::ThreadPool,
-    lazy: networks::SemanticNetworks,
+    lazy: networks::LazyNetworks,
 }
 
 impl Pipeline {
@@ -79,7 +85,7 @@ impl Pipeline {
             .thread_name(|i| format!("pipeline-{i}"))
             .build()
             .map_err(|e| Error::internal("pipeline: no worker threads").caused_by(e))?;
-        let lazy = networks::SemanticNetworks::new(options);
+        let lazy = networks::LazyNetworks::new(options);
         let pipeline = Self { runtime, bundle, geometry, workers, lazy };
         // A device takes seconds for its first run, so that no text should wait for it. It is also
         // where a provider that computes the semantics wrong is refused.
@@ -164,52 +170,60 @@ impl Reconstruction {
     }
 }
 
-/// The photos of an upload, read and undistorted.
-#[derive(Clone, Debug)]
-pub struct PhotoSet {
-    /// The photos, in the order of the cameras.
-    pub photos: Vec<PosedPhoto>,
-    /// What of the upload was not used or not there.
-    pub warnings: Vec<Warning>,
-    /// How long that took, milliseconds.
-    pub read_ms: f64,
-}
-
-impl PhotoSet {
-    /// Bytes of the pixels.
-    #[must_use]
-    pub fn size_bytes(&self) -> u64 {
-        let bytes = |photo: &Photo| photo.rgb.len() + photo.valid.as_ref().map_or(0, Vec::len);
-        self.photos.iter().map(|posed| bytes(&posed.photo) as u64).sum()
-    }
-}
-
 /// Reads an upload: the stage [`Stage::Photos`].
 ///
 /// # Errors
 /// `invalid_request`, `photo_unreadable`, `limit_exceeded`, each names photo, value and bound;
 /// `cancelled`.
-pub fn read(upload: &Upload, limits: &Limits, cancel: &AtomicBool) -> Result<PhotoSet> {
-    timed(|| photos::read_until(upload, limits, cancel).map(|read| (read, ()))).map(|(set, ())| set)
+pub fn read(
+    upload: &Upload,
+    mode: CamerasMode,
+    limits: &Limits,
+    cancel: &AtomicBool,
+) -> Result<ReadSet> {
+    let begun = Instant::now();
+    let set = match photos::read_unposed(upload, mode, limits, cancel)? {
+        Some(read) => unposed(read, begun),
+        None => given(photos::read_until(upload, limits, cancel)?, begun),
+    };
+    Ok(set)
 }
 
 /// Reads a folder: as [`read`], and the files that were read as an upload.
 ///
 /// # Errors
 /// As [`read`].
-pub fn read_dir(dir: &Path, limits: &Limits, cancel: &AtomicBool) -> Result<(PhotoSet, Upload)> {
-    timed(|| photos::read_dir_until(dir, limits, cancel))
-}
-
-fn timed<T>(read: impl FnOnce() -> Result<(ReadPhotos, T)>) -> Result<(PhotoSet, T)> {
+pub fn read_dir(
+    dir: &Path,
+    mode: CamerasMode,
+    limits: &Limits,
+    cancel: &AtomicBool,
+) -> Result<(ReadSet, Upload)> {
     let begun = Instant::now();
-    let (ReadPhotos { photos, warnings }, more) = read()?;
-    let read_ms = begun.elapsed().as_secs_f64() * 1e3;
-    meter::stage(Stage::Photos.name(), read_ms / 1e3);
-    Ok((PhotoSet { photos, warnings, read_ms }, more))
+    if let Some((read, upload)) = photos::read_unposed_dir(dir, mode, limits, cancel)? {
+        return Ok((unposed(read, begun), upload));
+    }
+    let (read, upload) = photos::read_dir_until(dir, limits, cancel)?;
+    Ok((given(read, begun), upload))
 }
 
-/// The stages from read photos to Gaussians, the time of reading them in the report.
+fn given(read: ReadPhotos, begun: Instant) -> ReadSet {
+    let ReadPhotos { photos, warnings } = read;
+    ReadSet::Posed(PhotoSet::given(photos, warnings, took_to_read(begun)))
+}
+
+fn unposed(read: ReadUnposed, begun: Instant) -> ReadSet {
+    let ReadUnposed { photos, warnings } = read;
+    ReadSet::Unposed(UnposedSet { photos, warnings, read_ms: took_to_read(begun) })
+}
+
+fn took_to_read(begun: Instant) -> f64 {
+    let ms = begun.elapsed().as_secs_f64() * 1e3;
+    meter::stage(Stage::Photos.name(), ms / 1e3);
+    ms
+}
+
+/// The stages from posed photos to Gaussians, the times of those before in the report.
 ///
 /// # Errors
 /// As [`reconstruct`].
@@ -223,10 +237,10 @@ pub fn make(
     Ok(with_reading(made, photos))
 }
 
-/// A reconstruction whose report has the stage of reading the photos.
+/// A reconstruction whose report has the stages before it, and where the cameras come from.
 fn with_reading(mut made: Reconstruction, photos: &PhotoSet) -> Reconstruction {
-    let stage = Stage::Photos.name().to_owned();
-    made.report.stages.insert(0, StageTime { stage, ms: photos.read_ms });
+    made.report.stages.splice(0..0, photos.stages.iter().cloned());
+    made.report.cameras = photos.cameras.clone();
     made.report.warnings.splice(0..0, photos.warnings.iter().cloned());
     made
 }
@@ -401,6 +415,7 @@ fn united(
         file_format: None,
         antialiased: false,
         method,
+        cameras: CamerasReport::default(),
         views_used: count(used(&sets, photos.len())),
         gaussians: lifted.gaussians.len() as u64,
         dropped: lifted.dropped,

@@ -6,20 +6,23 @@ use parking_lot::Mutex;
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    models::{ImageText, MaskNetwork, NetworkOptions},
+    models::{FeatureNetwork, ImageText, MaskNetwork, NetworkOptions},
 };
 
-/// The networks that semantics need, opened at the first use and kept.
+/// The networks that not every scene needs, opened at the first use and kept.
 #[derive(Debug)]
-pub(super) struct SemanticNetworks {
+pub(super) struct LazyNetworks {
     pub(super) options: NetworkOptions,
     pub(super) masks: Mutex<Option<Arc<MaskNetwork>>>,
     pub(super) image_text: Mutex<Option<Arc<ImageText>>>,
+    pub(super) features: Mutex<Option<Arc<FeatureNetwork>>>,
 }
 
-impl SemanticNetworks {
+impl LazyNetworks {
     pub(super) fn new(options: &NetworkOptions) -> Self {
-        Self { options: options.clone(), masks: Mutex::default(), image_text: Mutex::default() }
+        let options = options.clone();
+        let (masks, image_text, features) = Default::default();
+        Self { options, masks, image_text, features }
     }
 
     /// Why an open network is not computed where it was to be; one that is being opened says

@@ -72,21 +72,28 @@ pub(super) fn find(folder: &Folder<'_>) -> Vec<Seen> {
 }
 
 /// What finds the cameras of photos alone; README and docs/captures.md have the same lines.
-pub(super) const FIND_CAMERAS: &str = r#"photos alone: these find cameras (pip install pycolmap):
+pub const FIND_CAMERAS: &str = r#"photos alone: these find cameras (pip install pycolmap):
 pycolmap.extract_features("photos/database.db", "photos/images")
 pycolmap.match_exhaustive("photos/database.db")
 pycolmap.incremental_mapping("photos/database.db", "photos/images", "photos/sparse")
 Then send the folder "photos". docs/captures.md says more"#;
 
+/// A file of cameras that are not read, and what it is.
+pub(super) fn not_read<'f>(folder: &'f Folder<'_>) -> Option<(&'f str, &'static str)> {
+    folder.paths().find_map(|path| {
+        let name = names::file_name(path).to_lowercase();
+        NOT_READ.iter().find(|(ending, _)| name.ends_with(ending)).map(|(_, of)| (path, *of))
+    })
+}
+
 /// The message where no cameras were found.
 pub(super) fn none(folder: &Folder<'_>) -> String {
     let known = LAYOUTS.map(|(layout, _)| layout.name()).join(", ");
-    let not_read = folder.paths().find_map(|path| {
-        let name = names::file_name(path).to_lowercase();
-        NOT_READ.iter().find(|(ending, _)| name.ends_with(ending)).map(|(_, of)| (path, of))
-    });
-    let not_read = not_read.map_or_else(String::new, |(path, of)| {
-        format!("; {path:?} is {of}, which is not read: export the cameras as COLMAP's text")
+    let not_read = not_read(folder).map_or_else(String::new, |(path, of)| {
+        format!(
+            "; {path:?} is {of}, which is not read: export the cameras as COLMAP's text, or have \
+             them solved from the photos (cameras=solve)"
+        )
     });
     format!(
         "{}: no transforms.json and no cameras.json in it, nor another layout with cameras; {} \

@@ -1,0 +1,260 @@
+//! The cameras of photos that came without: keypoints ▸ matches ▸ `segsplat_cameras` ▸ judge.
+//!
+//! The solver sees keypoints alone. The judge is the plane sweep of `capture`, which compares the
+//! photos' pixels under the cameras: what it calls wrong of given cameras refuses solved ones.
+
+use std::{sync::Arc, time::Instant};
+
+use rayon::prelude::*;
+use segsplat_cameras::{
+    CONFIDENCE_MIN, Evidence, PairMatches, PhotoKeypoints, Placed, Placing, Solution, SolveOptions,
+    pairs_to_match, solve,
+};
+
+use super::{
+    Pipeline, fraction,
+    networks::opened,
+    sets::{PhotoSet, UnposedSet, read_time},
+};
+use crate::{
+    capture,
+    error::{Error, ErrorCode, Result, short},
+    formats::captures::FIND_CAMERAS,
+    matching::Descriptors,
+    meter,
+    models::FeatureNetwork,
+    photos,
+    scene::{
+        Camera, CamerasReport, CamerasSource, LeftOutPhoto, PlacedPhoto, PosedPhoto, SolvedCamera,
+        Stage, StageTime, UnposedPhoto, Warning, WarningCode, Watch, unless_cancelled,
+    },
+};
+
+/// Where keypoints and matches end in the stage.
+const KEYPOINTS_END: f32 = 0.5;
+const MATCHES_END: f32 = 0.65;
+const SOLVED_END: f32 = 0.95;
+/// Fewest photos that make a scene.
+const PLACED_MIN: usize = 2;
+/// Photos that one message names.
+const NAMED_MAX: usize = 4;
+/// What can be done about photos whose cameras are not found.
+const REMEDY: &str = "Take more photos, each of which shows most of what the one before shows, of \
+    things with texture; or send cameras with them";
+
+/// What the solver and the judge found: for whoever measures them.
+#[derive(Clone, Debug)]
+pub struct JudgedCameras {
+    /// How likely the cameras are right, 0..1.
+    pub confidence: f64,
+    /// What the confidence is made of.
+    pub evidence: Evidence,
+    /// Each photo's camera, or why it has none, in their order.
+    pub placings: Vec<Placing>,
+    /// Why the cameras are refused; `None`: they are not.
+    pub refused: Option<String>,
+}
+
+impl JudgedCameras {
+    /// The camera of each photo, where it has one, in their order.
+    pub fn cameras(&self) -> impl Iterator<Item = Option<Camera>> {
+        self.placings.iter().map(|placing| match placing {
+            Placing::Placed(placed) => Some(placed.camera),
+            Placing::LeftOut(_) => None,
+        })
+    }
+}
+
+impl Pipeline {
+    /// The feature network, opened at the first call.
+    ///
+    /// # Errors
+    /// `model_unavailable` when the bundle has none or it does not open.
+    pub fn features(&self) -> Result<Arc<FeatureNetwork>> {
+        let open = || FeatureNetwork::open(&self.runtime, &self.bundle, &self.lazy.options);
+        opened(&self.lazy.features, "feature network, which finds the cameras of photos", open)
+    }
+}
+
+/// Finds the cameras of photos: the stage [`Stage::Cameras`]. Photos without one are left out.
+///
+/// # Errors
+/// `cameras_unsolved` when they cannot be found or the photos do not confirm them;
+/// `model_unavailable`, `cancelled`, `internal`.
+pub fn posed(pipeline: &Pipeline, set: UnposedSet, watch: Watch<'_>) -> Result<PhotoSet> {
+    let begun = Instant::now();
+    unless_cancelled(watch.cancel)?;
+    let _span = tracing::info_span!("stage", stage = Stage::Cameras.name()).entered();
+    let UnposedSet { photos, mut warnings, read_ms } = set;
+    let solution = solved(pipeline, &photos, watch)?;
+    let confirmed = confirmed(pipeline, photos, &solution, watch)?;
+    let Confirmed { photos, cameras, doubts } = confirmed;
+    warnings.extend(left_out(&cameras.left_out));
+    warnings.extend(doubts);
+    let ms = begun.elapsed().as_secs_f64() * 1e3;
+    meter::stage(Stage::Cameras.name(), ms / 1e3);
+    (watch.progress)(Stage::Cameras, 1.0);
+    let own = StageTime { stage: Stage::Cameras.name().to_owned(), ms };
+    Ok(PhotoSet { photos, warnings, stages: vec![read_time(read_ms), own], cameras })
+}
+
+/// What [`posed`] finds, and whether it would refuse it.
+///
+/// # Errors
+/// As [`posed`], but for `cameras_unsolved`.
+pub fn judged(
+    pipeline: &Pipeline,
+    photos: &[UnposedPhoto],
+    watch: Watch<'_>,
+) -> Result<JudgedCameras> {
+    let solution = solved(pipeline, photos, watch)?;
+    let refused = match confirmed(pipeline, photos.to_vec(), &solution, watch) {
+        Ok(_) => None,
+        Err(e) if e.code() == ErrorCode::CamerasUnsolved => Some(e.message().to_owned()),
+        Err(error) => return Err(error),
+    };
+    let Solution { confidence, evidence, photos: placings, .. } = solution;
+    Ok(JudgedCameras { confidence, evidence, placings, refused })
+}
+
+/// The solver's answer.
+fn solved(pipeline: &Pipeline, photos: &[UnposedPhoto], watch: Watch<'_>) -> Result<Solution> {
+    let Watch { progress, cancel } = watch;
+    let tell = |fraction: f32| progress(Stage::Cameras, fraction);
+    let network = pipeline.features()?;
+    let (mut keypoints, mut descriptors) = (Vec::new(), Vec::new());
+    for (done, unposed) in photos.iter().enumerate() {
+        unless_cancelled(cancel)?;
+        tell(KEYPOINTS_END * fraction(done, photos.len()));
+        let found = pipeline.workers.install(|| network.find(&unposed.photo))?;
+        descriptors.push(Descriptors::new(&found.descriptors, found.dim));
+        keypoints.push(PhotoKeypoints {
+            size: [unposed.photo.width, unposed.photo.height],
+            focal: unposed.focal,
+            keypoints: found.keypoints,
+            seconds: None,
+        });
+    }
+    tell(KEYPOINTS_END);
+    let alike = |i: usize, j: usize| descriptors[i].alike(&descriptors[j]);
+    let pairs = pairs_to_match(photos.len(), alike);
+    let least = network.manifest().similarity_min;
+    let matched = |&[i, j]: &[usize; 2]| {
+        unless_cancelled(cancel)?;
+        let found = descriptors[i].matched(&descriptors[j], least);
+        let pairs = found.iter().map(|pair| pair.keypoints).collect();
+        let scores = found.iter().map(|pair| pair.similarity.clamp(0.0, 1.0)).collect();
+        Ok::<_, Error>(PairMatches { photos: [i, j], pairs, scores })
+    };
+    let matches = pipeline
+        .workers
+        .install(|| pairs.par_iter().map(matched).collect::<Result<Vec<PairMatches>>>())?;
+    drop(descriptors);
+    tell(MATCHES_END);
+    let options = SolveOptions {
+        photos_max: photos.len(),
+        keypoints_max: network.manifest().count,
+        ..SolveOptions::default()
+    };
+    let share = |done: f64| tell(MATCHES_END + (SOLVED_END - MATCHES_END) * done as f32);
+    pipeline.workers.install(|| solve(&keypoints, &matches, &options, cancel, &share))
+}
+
+/// Photos whose cameras stand the judgement.
+struct Confirmed {
+    photos: Vec<PosedPhoto>,
+    cameras: CamerasReport,
+    doubts: Vec<Warning>,
+}
+
+/// The photos with their cameras, which the solver trusts and the photos' pixels confirm.
+fn confirmed(
+    pipeline: &Pipeline,
+    photos: Vec<UnposedPhoto>,
+    solution: &Solution,
+    watch: Watch<'_>,
+) -> Result<Confirmed> {
+    let count = photos.len();
+    let (mut posed, mut placed, mut left_out) = (Vec::new(), Vec::new(), Vec::new());
+    for (unposed, placing) in photos.into_iter().zip(&solution.photos) {
+        let file = unposed.file.clone();
+        match placing {
+            Placing::Placed(Placed { camera, k1, inliers, error_px }) => {
+                posed.push(photos::posed(unposed, &SolvedCamera { camera: *camera, k1: *k1 }));
+                let (inliers, error_px, k1) = (*inliers as u64, *error_px, *k1);
+                placed.push(PlacedPhoto { file, inliers, error_px, k1 });
+            }
+            Placing::LeftOut(reason) => {
+                left_out.push(LeftOutPhoto { file, reason: reason.clone() });
+            }
+        }
+    }
+    let refused = |why: &str| {
+        let named = named(&left_out);
+        let message = format!("cameras: {why}{named}. {REMEDY}. Of {FIND_CAMERAS}");
+        Error::new(ErrorCode::CamerasUnsolved, message)
+    };
+    if posed.len() < PLACED_MIN {
+        return Err(refused(&format!("the cameras of {count} photos cannot be found")));
+    }
+    let confidence = solution.confidence;
+    if confidence < CONFIDENCE_MIN {
+        let doubts = solution.warnings.join("; ");
+        let doubts = if doubts.is_empty() { doubts } else { format!(" ({doubts})") };
+        return Err(refused(&format!(
+            "the cameras of {} of {count} photos were found, with a confidence of {confidence:.2}, \
+             under {CONFIDENCE_MIN}: they may well be wrong{doubts}",
+            posed.len()
+        )));
+    }
+    let judge = || capture::analyse(&posed, watch.cancel);
+    let wrong = match pipeline.workers.install(judge) {
+        Ok(seen) => seen.warnings.into_iter().find(|warning| speaks_against(warning.code)),
+        Err(e) if e.code() == ErrorCode::InvalidRequest => {
+            return Err(refused(&format!("the photos do not confirm them: {}", e.message())));
+        }
+        Err(error) => return Err(error),
+    };
+    if let Some(Warning { message, .. }) = wrong {
+        return Err(refused(&format!("the photos do not confirm them: {message}")));
+    }
+    let doubt = |message: &String| Warning {
+        code: WarningCode::CamerasDoubtful,
+        message: format!("cameras: {message}"),
+        value: confidence,
+    };
+    // Photos that were left out are named once.
+    let is_told = |message: &&String| left_out.iter().any(|of| message.contains(&of.reason));
+    let doubts = solution.warnings.iter().filter(|m| !is_told(m)).map(doubt).collect();
+    let confidence = Some(confidence);
+    let cameras = CamerasReport { source: CamerasSource::Solved, confidence, placed, left_out };
+    Ok(Confirmed { photos: posed, cameras, doubts })
+}
+
+/// Whether a warning of given cameras says that solved ones are wrong.
+fn speaks_against(code: WarningCode) -> bool {
+    matches!(
+        code,
+        WarningCode::AxesSwapped
+            | WarningCode::PoseInverted
+            | WarningCode::IntrinsicsScale
+            | WarningCode::PoorPoseAgreement
+    )
+}
+
+/// Names photos that were left out, with their reasons, for a message.
+fn named(left_out: &[LeftOutPhoto]) -> String {
+    let one = |of: &LeftOutPhoto| format!("{:?}: {}", short(&of.file), of.reason);
+    let some: Vec<String> = left_out.iter().take(NAMED_MAX).map(one).collect();
+    let more = left_out.len().saturating_sub(NAMED_MAX);
+    let more = if more > 0 { format!("; and {more} more") } else { String::new() };
+    if some.is_empty() { String::new() } else { format!("; left out: {}{more}", some.join("; ")) }
+}
+
+/// Warns of photos that were left out.
+fn left_out(left_out: &[LeftOutPhoto]) -> Option<Warning> {
+    let count = left_out.len();
+    let message = format!("{count} photos have no camera{}", named(left_out));
+    let code = WarningCode::PhotosUnused;
+    (count > 0).then_some(Warning { code, message, value: count as f64 })
+}

@@ -1,0 +1,85 @@
+//! The photos of an upload: with cameras, or without.
+
+use crate::{
+    photos,
+    scene::{
+        CamerasReport, Photo, PosedPhoto, SceneCamera, Stage, StageTime, UnposedPhoto, Warning,
+    },
+};
+
+/// The photos of an upload with their cameras, read and undistorted.
+#[derive(Clone, Debug)]
+pub struct PhotoSet {
+    /// The photos, in the order of the cameras.
+    pub photos: Vec<PosedPhoto>,
+    /// What of the upload was not used or not there.
+    pub warnings: Vec<Warning>,
+    /// How long the stages until here took.
+    pub stages: Vec<StageTime>,
+    /// Where the cameras come from.
+    pub cameras: CamerasReport,
+}
+
+impl PhotoSet {
+    /// Photos whose cameras were given, and how long reading them took, milliseconds.
+    #[must_use]
+    pub fn given(photos: Vec<PosedPhoto>, warnings: Vec<Warning>, read_ms: f64) -> Self {
+        let stages = vec![read_time(read_ms)];
+        Self { photos, warnings, stages, cameras: CamerasReport::default() }
+    }
+
+    /// Bytes of the pixels.
+    #[must_use]
+    pub fn size_bytes(&self) -> u64 {
+        self.photos.iter().map(|posed| bytes_of(&posed.photo)).sum()
+    }
+}
+
+fn bytes_of(photo: &Photo) -> u64 {
+    (photo.rgb.len() + photo.valid.as_ref().map_or(0, Vec::len)) as u64
+}
+
+pub(super) fn read_time(ms: f64) -> StageTime {
+    StageTime { stage: Stage::Photos.name().to_owned(), ms }
+}
+
+/// The photos of an upload, with cameras or without.
+#[derive(Clone, Debug)]
+pub enum ReadSet {
+    /// Their cameras came with them.
+    Posed(PhotoSet),
+    /// Their cameras are to be solved: `cameras::posed`.
+    Unposed(UnposedSet),
+}
+
+/// Photos of an upload without cameras.
+#[derive(Clone, Debug)]
+pub struct UnposedSet {
+    /// The photos, in the order of their names.
+    pub photos: Vec<UnposedPhoto>,
+    /// What of the upload was not used.
+    pub warnings: Vec<Warning>,
+    /// How long reading took, milliseconds.
+    pub read_ms: f64,
+}
+
+impl UnposedSet {
+    /// Bytes of the pixels.
+    #[must_use]
+    pub fn size_bytes(&self) -> u64 {
+        self.photos.iter().map(|unposed| bytes_of(&unposed.photo)).sum()
+    }
+
+    /// The photos of a scene that was made of these, with its cameras.
+    #[must_use]
+    pub fn posed_as(self, cameras: &[SceneCamera], report: &CamerasReport) -> PhotoSet {
+        let Self { mut photos, warnings, read_ms } = self;
+        let mut posed = Vec::with_capacity(cameras.len());
+        for (file, solved) in photos::solved(cameras, report) {
+            let Some(at) = photos.iter().position(|photo| photo.file == file) else { continue };
+            posed.push(photos::posed(photos.swap_remove(at), &solved));
+        }
+        let stages = vec![read_time(read_ms)];
+        PhotoSet { photos: posed, warnings, stages, cameras: report.clone() }
+    }
+}
