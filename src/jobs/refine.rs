@@ -32,12 +32,6 @@ use crate::{
     store::{Record, RefineOrder},
 };
 
-/// Time without views after which it goes on.
-const QUIET: Duration = Duration::from_millis(250);
-/// Where views never end it goes on after so many times the time that it worked, or so long: a
-/// step takes a millisecond of a device, and a tenth of a second of a processor.
-const WAITS: u32 = 3;
-const PATIENCE: Duration = Duration::from_secs(1);
 /// A change of the fraction that watchers are told.
 const TOLD: f32 = 0.01;
 
@@ -249,7 +243,11 @@ impl GivesWay<'_> {
             makes && kind != job.kind
         };
         jobs.bell.wait_in_job(&job.cancel, || {
-            let left = views_go_first((jobs.parts.since_last_view)(), worked, begun.elapsed());
+            let left = jobs.parts.refiner.manners().views_go_first(
+                (jobs.parts.since_last_view)(),
+                worked,
+                begun.elapsed(),
+            );
             match left.is_zero() {
                 false => Err(left),
                 true if jobs.kinds.iter().any(|kind| is_made(*kind)) => Err(FOREVER),
@@ -258,29 +256,5 @@ impl GivesWay<'_> {
         })?;
         *resumed = Instant::now();
         Ok(())
-    }
-}
-
-/// How much longer views go first: the last was drawn some time ago, and the refinement waits since
-/// it `worked` so long.
-fn views_go_first(last_view: Option<Duration>, worked: Duration, waited: Duration) -> Duration {
-    let quiet = last_view.map_or(Duration::ZERO, |ago| QUIET.saturating_sub(ago));
-    quiet.min((worked * WAITS).min(PATIENCE).saturating_sub(waited))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn views_without_end_leave_a_fourth_of_the_time() {
-        let ms = Duration::from_millis;
-        let left = |last_view: Option<u64>, worked, waited| {
-            views_go_first(last_view.map(ms), ms(worked), ms(waited)).as_millis()
-        };
-        assert_eq!(left(None, 100, 0), 0, "nobody looks");
-        assert_eq!([left(Some(250), 100, 0), left(Some(240), 100, 0)], [0, 10], "a quiet moment");
-        assert_eq!([left(Some(0), 1, 0), left(Some(0), 1, 2), left(Some(0), 1, 3)], [3, 1, 0]);
-        assert_eq!([left(Some(0), 5_000, 900), left(Some(0), 5_000, 1_000)], [100, 0]);
     }
 }

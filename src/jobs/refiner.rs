@@ -1,6 +1,6 @@
 //! What refines scenes: the device on which views are drawn, or threads of low priority.
 
-use std::sync::Arc;
+use std::{sync::Arc, time::Duration};
 
 use super::background::background_threads;
 use crate::{
@@ -16,6 +16,36 @@ const AUTO_CPU_MS: u64 = 120_000;
 const AUTO_MS: [u64; 2] = [10_000, 60_000];
 /// Threads that it has on the processor at least, where there are so many.
 const THREADS_MIN: usize = 2;
+
+/// How a refinement lets views go first. A step takes a millisecond of a device, and a tenth of a
+/// second of a processor, which a view then has to share.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Manners {
+    /// Time without views after which it goes on.
+    quiet: Duration,
+    /// Where views never end it goes on after so many times the time that it worked, or so long.
+    waits: u32,
+    patience: Duration,
+}
+
+const ON_A_DEVICE: Manners =
+    Manners { quiet: Duration::from_millis(250), waits: 3, patience: Duration::from_secs(1) };
+const ON_A_PROCESSOR: Manners =
+    Manners { quiet: Duration::from_secs(1), waits: 20, patience: Duration::from_secs(3) };
+
+impl Manners {
+    /// How much longer views go first: the last was drawn some time ago, and the refinement waits
+    /// since it `worked` so long.
+    pub(super) fn views_go_first(
+        &self,
+        last_view: Option<Duration>,
+        worked: Duration,
+        waited: Duration,
+    ) -> Duration {
+        let quiet = last_view.map_or(Duration::ZERO, |ago| self.quiet.saturating_sub(ago));
+        quiet.min((worked * self.waits).min(self.patience).saturating_sub(waited))
+    }
+}
 
 /// What refines scenes, and where.
 pub(crate) struct Refiner {
@@ -62,6 +92,11 @@ impl Refiner {
         }
     }
 
+    /// How it lets views go first.
+    pub(super) fn manners(&self) -> Manners {
+        if self.threads.is_some() { ON_A_PROCESSOR } else { ON_A_DEVICE }
+    }
+
     /// Milliseconds that a scene of so many photos is to be refined for; `None`: not at all.
     pub(crate) fn budget_ms(&self, refine: Refine, photos: usize) -> Option<u64> {
         let own = self.threads.as_ref().map(|threads| threads.current_num_threads());
@@ -102,5 +137,21 @@ mod tests {
         };
         assert_eq!([threads(1, 50), threads(2, 50), threads(7, 50)], [1, 2, 4]);
         assert_eq!([threads(4, 0), threads(4, 100), threads(4, 900)], [2, 4, 4]);
+    }
+
+    #[test]
+    fn views_without_end_leave_a_share_of_the_time() {
+        let ms = Duration::from_millis;
+        let left = |manners: Manners, last_view: Option<u64>, worked, waited| {
+            manners.views_go_first(last_view.map(ms), ms(worked), ms(waited)).as_millis()
+        };
+        let gpu = |last_view, worked, waited| left(ON_A_DEVICE, last_view, worked, waited);
+        assert_eq!(gpu(None, 100, 0), 0, "nobody looks");
+        assert_eq!([gpu(Some(250), 100, 0), gpu(Some(240), 100, 0)], [0, 10], "a quiet moment");
+        assert_eq!([gpu(Some(0), 1, 0), gpu(Some(0), 1, 2), gpu(Some(0), 1, 3)], [3, 1, 0]);
+        assert_eq!([gpu(Some(0), 5_000, 900), gpu(Some(0), 5_000, 1_000)], [100, 0]);
+        let cpu = |last_view, worked, waited| left(ON_A_PROCESSOR, last_view, worked, waited);
+        assert_eq!([cpu(Some(900), 100, 0), cpu(Some(0), 10, 199)], [100, 1]);
+        assert_eq!(cpu(Some(0), 900, 2_000), 1_000);
     }
 }

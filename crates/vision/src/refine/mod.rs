@@ -162,7 +162,7 @@ impl Default for RefineOptions {
             prune_every: 50,
             ssim_share: 0.2,
             first_steps: 400,
-            gain_min: 0.1,
+            gain_min: 0.2,
             proof_share: 0.25,
             overfit_max: 1.5,
             device_bytes_max: 2 << 30,
