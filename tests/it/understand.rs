@@ -317,7 +317,7 @@ fn masks_of_one_thing_are_a_row_whatever_each_looks_like() {
         let all = made.views.entries.iter().zip(made.views.rows.as_chunks::<3>().0);
         all.filter(|(m, _)| usize::from(**m) == entry).map(|(_, row)| *row).collect()
     };
-    assert_eq!(of_row(right), [looks[1], looks[2]].map(|row| row));
+    assert_eq!(of_row(right), [looks[1], looks[2]]);
     assert_eq!(of_row(left), [looks[3], looks[0]], "the larger mask first");
     assert_eq!(made.bank.row(right - 1), [0.0, 0.5, 0.5], "the mean");
     assert_eq!(
