@@ -35,8 +35,7 @@ use crate::{
     scene::{
         Backdrop, Camera, CamerasMode, CamerasReport, Capture, Density, Gaussians, HealthReport,
         Intrinsics, Method, PosedPhoto, Provenance, Scene, SceneCamera, SceneId, SceneMeta,
-        SceneOptions, Stage, StageTime, Upload, ViewGaussians, ViewSet, Warning, Watch,
-        unless_cancelled,
+        SceneOptions, Stage, StageTime, Upload, ViewGaussians, ViewSet, Watch, unless_cancelled,
     },
 };
 
