@@ -150,7 +150,9 @@ async fn photos_that_cannot_be_solved_are_refused_with_what_to_do() {
         room(2, 1).0.remove(0),
         UploadFile { name: "other.png".to_owned(), ..room(2, 40).0.remove(0) },
     ];
-    for (photos, named) in [(plain.collect::<Vec<_>>(), "0.png"), (strangers.into(), "other.png")] {
+    for (photos, named) in
+        [(plain.collect::<Vec<_>>(), "0.png"), (strangers.into(), "nothing confirms their cameras")]
+    {
         let status = made(&server, photos).await;
         assert_eq!(status["code"], "cameras_unsolved", "{status}");
         let message = status["message"].as_str().unwrap();
