@@ -174,7 +174,7 @@ impl Jobs {
             match record.options.semantics {
                 SemanticsMode::Eager => {
                     self.uploads.keep(id, Arc::clone(&upload));
-                    // The photos may go from memory, and a job that reads them again has no cameras.
+                    // Photos may go from memory, and a job that reads them again has no cameras.
                     let is_given = photos.cameras.source == CamerasSource::Given;
                     if is_given && self.parts.semantics.begin_early(&record.options.method()) {
                         self.understand_early(id)?;

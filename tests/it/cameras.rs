@@ -1,7 +1,10 @@
 //! Photos without cameras, over HTTP, with the networks of the product: generated photos have exact
 //! cameras, which are hidden.
 
-use std::path::Path;
+use std::{
+    path::Path,
+    time::{Duration, Instant},
+};
 
 use glam::DMat3;
 use segsplat::{
@@ -16,8 +19,9 @@ use crate::common::{
     process::{self, Process, Start, can_serve, eventually},
 };
 
-/// Most by which a solved rotation may differ, degrees.
-const TURNED_DEG: f64 = 0.3;
+/// Most by which the turn between any two solved cameras may differ, degrees: the arc is short, so
+/// that without EXIF its photos tell the focal length to a per cent or two.
+const TURNED_DEG: f64 = 1.0;
 /// How long a scene may take on a busy machine.
 const WAIT_MS: u64 = 300_000;
 
@@ -146,7 +150,9 @@ async fn photos_that_cannot_be_solved_are_refused_with_what_to_do() {
         room(2, 1).0.remove(0),
         UploadFile { name: "other.png".to_owned(), ..room(2, 40).0.remove(0) },
     ];
-    for (photos, named) in [(plain.collect::<Vec<_>>(), "0.png"), (strangers.into(), "other.png")] {
+    for (photos, named) in
+        [(plain.collect::<Vec<_>>(), "0.png"), (strangers.into(), "nothing confirms their cameras")]
+    {
         let status = made(&server, photos).await;
         assert_eq!(status["code"], "cameras_unsolved", "{status}");
         let message = status["message"].as_str().unwrap();
@@ -163,7 +169,7 @@ async fn cameras_that_are_wrong_are_solved_where_that_is_asked() {
     }
     let data = tempfile::tempdir().unwrap();
     let server = server(data.path());
-    let (photos, truth) = room(6, 1);
+    let (photos, truth) = room(8, 1);
     // Each photo has the camera of another.
     let wrong = truth.iter().rev().zip(&photos).map(|(camera, file)| {
         json!({
@@ -197,7 +203,7 @@ async fn a_job_that_finds_cameras_is_resumed_after_a_kill_and_can_be_cancelled()
     }
     let data = tempfile::tempdir().unwrap();
     let mut server = server(data.path());
-    let photos = room(10, 1).0;
+    let photos = room(7, 1).0;
     let client = client();
     let begin = async |server: &Process| {
         let base = server.url("");
@@ -219,12 +225,16 @@ async fn a_job_that_finds_cameras_is_resumed_after_a_kill_and_can_be_cancelled()
     let id = begin(&server).await;
     server.kill();
     let server = self::server(data.path());
-    let url = server.url(&format!("/v1/scenes/{id}?wait_ms=60000"));
-    let status = eventually("the scene", async || {
+    let url = server.url(&format!("/v1/scenes/{id}"));
+    let begun = Instant::now();
+    let status = loop {
         let (_, status) = process::get(&client, &url).await.unwrap();
-        (status["state"] == "done").then_some(status)
-    });
-    let status = status.await;
+        if status["state"] == "done" {
+            break status;
+        }
+        assert!(begun.elapsed().as_millis() < u128::from(WAIT_MS), "{status}");
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    };
     assert_eq!(status["report"]["cameras"]["source"], "solved");
     assert_eq!(cameras(&status).len(), photos.len());
     let gone = server.url(&format!("/v1/scenes/{cancelled}"));

@@ -284,14 +284,14 @@ fn photos_without_cameras_get_them_and_a_file_of_them() {
     }
     let folder = tempfile::tempdir().unwrap();
     let photos = folder.path().join("only photos");
-    ok(&["sample", "-o", text(&photos), "--photos", "5", "--size", "480x360"]);
+    ok(&["sample", "-o", text(&photos), "--photos", "8", "--size", "480x360"]);
     let file = photos.join("transforms.json");
     std::fs::remove_file(&file).unwrap();
     let told = ok_json(&["cameras", text(&photos), "-o", text(&file)]);
-    assert_eq!(told["cameras"]["placed"].as_array().unwrap().len(), 5, "{told}");
+    assert_eq!(told["cameras"]["placed"].as_array().unwrap().len(), 8, "{told}");
     let written: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     let frames = written["frames"].as_array().unwrap();
-    assert_eq!(frames.len(), 5);
+    assert_eq!(frames.len(), 8);
     assert_eq!(
         (&frames[0]["w"], &frames[0]["file_path"]),
         (&json!(480), &json!("images/0000.png"))

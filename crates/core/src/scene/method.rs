@@ -112,8 +112,8 @@ macro_rules! method {
         pub struct SceneOptions {
             /// Views the network takes at once, 4 by default where the bundle takes as many.
             pub max_views: Option<usize>,
-            /// Whether the cameras of the upload are used: `auto` (default) those that it has, solved
-            /// where it has none; `solve` computes them from the photos in any case.
+            /// Whether the cameras of the upload are used: `auto` (default) those that it has,
+            /// solved where it has none; `solve` computes them from the photos in any case.
             #[param(inline)]
             pub cameras: CamerasMode,
             /// When a scene's semantics are made: `lazy` (default) with the first text, `eager` as

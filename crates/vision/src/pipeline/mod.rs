@@ -2,7 +2,8 @@
 //!
 //! [`Pipeline`] holds what is opened once (library, bundle, sessions). [`read`] makes photos of an
 //! upload, [`cameras::posed`] finds their cameras where they have none, [`reconstruct`] makes
-//! Gaussians of photos, and the caller stores the scene, which is the stage [`Stage::Store`]. [`semantics`] makes the semantics of a scene.
+//! Gaussians of photos, and the caller stores the scene, which is the stage [`Stage::Store`].
+//! [`semantics`] makes the semantics of a scene.
 
 pub mod cameras;
 mod loader;
