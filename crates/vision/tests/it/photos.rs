@@ -10,7 +10,9 @@ use image::{DynamicImage, ImageBuffer, ImageFormat, Rgb, RgbImage};
 use segsplat_core::{
     error::ErrorCode,
     limits::Limits,
-    scene::{PosedPhoto, Upload, UploadCameras, UploadFile, WarningCode},
+    scene::{
+        CamerasMode, CamerasReport, PosedPhoto, Upload, UploadCameras, UploadFile, WarningCode,
+    },
 };
 use segsplat_vision::{
     photos,
@@ -24,6 +26,11 @@ use crate::room;
 
 fn options() -> SampleOptions {
     SampleOptions { photos: 3, width: 48, height: 36, seed: 5 }
+}
+
+/// What a scene of given cameras knows of them.
+fn given(report: &CamerasReport) -> photos::KnownCameras<'_> {
+    photos::KnownCameras { mode: CamerasMode::Auto, cameras: &[], report }
 }
 
 fn sent() -> (Vec<PosedPhoto>, Vec<UploadFile>) {
@@ -575,7 +582,7 @@ fn each_photo_is_its_file_or_the_pixels_that_a_scene_has() {
         let upload = with_transforms(&cameras, sent().1);
         let all = photos::read(&upload, &limits).unwrap();
         let mut rest = all.iter();
-        photos::each(&upload, &limits, |one| {
+        photos::each(&upload, given(&CamerasReport::default()), &limits, |one| {
             let posed = rest.next().expect("no more than all");
             assert_eq!((one.file, one.camera), (&*posed.file, posed.camera), "{what}");
             let rgb = match one.pixels {
@@ -781,7 +788,8 @@ fn photos_are_turned_where_their_cameras_are_those_of_the_upright_ones() {
             assert!(off < 3.0, "{what}: {off} of 255");
         }
         // One at a time they are the same.
-        photos::each(&upload, &Limits::default(), |one| {
+        let report = CamerasReport::default();
+        photos::each(&upload, given(&report), &Limits::default(), |one| {
             let is_file = matches!(one.pixels, photos::SentPixels::File(_));
             assert_eq!(is_file, !is_turned, "{what}");
             Ok(())

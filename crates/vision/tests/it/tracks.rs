@@ -63,7 +63,7 @@ fn masks_without_an_embedding_have_no_row_and_those_on_no_gaussian_come_last() {
         .map(|(v, camera)| {
             let mut camera = camera.clone();
             if v == 2 {
-                camera.network = None
+                camera.network = None;
             }
             camera
         })
