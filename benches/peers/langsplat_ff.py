@@ -317,7 +317,7 @@ def main():
     parser.add_argument("--machine", default="this machine")
     args = parser.parse_args()
     if args.recipe == "paper" and args.photos != 2:
-        parser.error(f"a batch of two photos is all of them only with --photos 2, not {args.photos}")
+        parser.error(f"two photos a batch are all only with --photos 2, not {args.photos}")
     torch.set_num_threads(args.threads)
     texts, rows = Texts(args.bundle), []
     named = args.only.split(",") if args.only else None

@@ -24,5 +24,5 @@ fn refined_scenes_have_both_figures_and_begin_with_what_is_named() {
     assert!(plain[1] > plain[0] + 0.3, "{plain:?}");
     assert!((plain[1] - layers[1]).abs() > 1e-4, "both begin the same: {plain:?}");
     let fault = of("steps=20,networks_ms=9").unwrap().unwrap_err();
-    assert!(fault.message().contains("networks_ms is of `many`"), "{fault}");
+    assert!(fault.message().contains("unknown field `networks_ms`"), "{fault}");
 }

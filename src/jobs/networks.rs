@@ -70,13 +70,18 @@ pub trait SceneNetworks: Send + Sync {
         Err(Error::new(ErrorCode::ModelUnavailable, "there are no networks"))
     }
 
+    /// Whether there is a network that finds the cameras of photos. Else the call that sends photos
+    /// alone is refused.
+    fn finds_cameras(&self) -> bool {
+        false
+    }
+
     /// Finds the cameras of photos that came without, on the calling thread.
     ///
     /// # Errors
     /// Any code; it becomes the scene's `error`.
     fn pose(&self, _: UnposedSet, _: Watch<'_>) -> Result<PhotoSet> {
-        let why = "no network finds the cameras of photos; send cameras with them";
-        Err(Error::new(ErrorCode::ModelUnavailable, why))
+        Err(Error::internal("no network finds cameras"))
     }
 
     /// Does the whole work on the calling thread.
@@ -253,6 +258,10 @@ impl SceneNetworks for PipelineNetworks {
             let why = "the networks are being opened; ask again";
             Err(Error::new(ErrorCode::ModelUnavailable, why).retry_after_s(OPENING_RETRY_S))
         })
+    }
+
+    fn finds_cameras(&self) -> bool {
+        self.0.bundle().features().is_some()
     }
 
     fn pose(&self, photos: UnposedSet, watch: Watch<'_>) -> Result<PhotoSet> {

@@ -77,6 +77,11 @@ impl ReadUpload {
         Self { content, ..self }
     }
 
+    /// Whether it is photos whose cameras are to be found.
+    pub(super) fn is_unposed(&self) -> bool {
+        matches!(self.content, Content::Unposed(_))
+    }
+
     /// Whether it is photos, and no file of Gaussians.
     pub(super) fn is_of_photos(&self) -> bool {
         !matches!(self.content, Content::Splats(_))

@@ -15,12 +15,17 @@ impl Jobs {
     ///
     /// # Errors
     /// `invalid_request`, `photo_unreadable`, `limit_exceeded` where the upload cannot be a scene;
+    /// `model_unavailable` where photos came without cameras and no network finds them;
     /// `idempotency_key_reused` when the key was used with others; `overloaded` when the queue is
     /// full or the server stops; `store_unavailable` where it is not kept, or where earlier scenes
     /// wait for room.
     pub(crate) fn submit(&self, upload: Upload, mut record: Record) -> Result<SceneId> {
         let (limits, never) = (self.parts.limits.get(), AtomicBool::new(false));
         let read = ReadUpload::of(&upload, &record.options, &limits, &never)?;
+        if read.is_unposed() && !self.parts.scenes.finds_cameras() {
+            let why = "no network finds the cameras of photos; send cameras with them";
+            return Err(Error::new(ErrorCode::ModelUnavailable, why));
+        }
         record.options.semantics = read.semantics(record.options.semantics);
         if record.options.semantics == SemanticsMode::Off {
             record.status.semantics = SemanticsStatus::new(SemanticsState::Off);

@@ -56,7 +56,7 @@ async fn an_upload_that_cannot_be_a_scene_says_what_is_missing() {
     for (form, word) in [
         (Form::new().text("density", "full"), "no photos"),
         (photo(photo(Form::new(), "photo", "a.png"), "photo", "a.png"), "\"a.png\" was sent twice"),
-        (photo(Form::new(), "photo", "a.png"), "no camera description"),
+        (photo(Form::new(), "photo", "a.png"), "1 photo; a scene needs at least 2"),
         (photo(cameras(), "photo", "a.png"), "1 photo; a scene needs at least 2"),
         (cameras().text("transforms", "{}"), "camera description given twice"),
         (cameras().part("archive", file("a.zip", 1)), "its own camera description"),
