@@ -7,7 +7,7 @@ use crate::{
     error::Result,
     limits::Limits,
     refine::HOLDS_OUT_FROM,
-    render::{DifferentiableRenderer, Switches, cpu::CpuRenderer},
+    render::{DifferentiableRenderer, cpu::CpuRenderer},
     scene::Refine,
 };
 
@@ -73,7 +73,7 @@ impl Refiner {
         let cores = threads.max(1);
         let share = (cores * limits.refine_threads_percent as usize).div_ceil(100);
         let threads = background_threads(share.clamp(THREADS_MIN.min(cores), cores))?;
-        let renderer = CpuRenderer::on(Arc::clone(&threads), &Switches::default());
+        let renderer = CpuRenderer::on(Arc::clone(&threads));
         Ok(Self { renderer: Arc::new(renderer), threads: Some(threads), cores })
     }
 

@@ -97,12 +97,16 @@ impl CpuRenderer {
                 let why = format!("render: {threads} threads cannot be started");
                 Error::internal(why).caused_by(error)
             })?;
-        Ok(Self::on(Arc::new(pool), switches))
+        Ok(Self::switched(Arc::new(pool), switches))
     }
 
     /// A renderer that draws on these threads.
     #[must_use]
-    pub fn on(threads: Arc<rayon::ThreadPool>, switches: &Switches) -> Self {
+    pub fn on(threads: Arc<rayon::ThreadPool>) -> Self {
+        Self::switched(threads, &Switches::default())
+    }
+
+    fn switched(threads: Arc<rayon::ThreadPool>, switches: &Switches) -> Self {
         Self {
             threads,
             frames: Pool::default(),

@@ -197,9 +197,12 @@ fn confirmed(
     if posed.len() < PLACED_MIN {
         return Err(refused(&format!("the cameras of {count} photos cannot be found")));
     }
+    // Photos that were left out are named once.
+    let is_new = |message: &&String| !left_out.iter().any(|of| message.contains(&of.reason));
     let confidence = solution.confidence;
     if confidence < CONFIDENCE_MIN {
-        let doubts = solution.warnings.join("; ");
+        let doubts: Vec<&str> = solution.warnings.iter().filter(is_new).map(|m| &**m).collect();
+        let doubts = doubts.join("; ");
         let doubts = if doubts.is_empty() { doubts } else { format!(" ({doubts})") };
         return Err(refused(&format!(
             "the cameras of {} of {count} photos were found, with a confidence of {confidence:.2}, \
@@ -223,9 +226,7 @@ fn confirmed(
         message: format!("cameras: {message}"),
         value: confidence,
     };
-    // Photos that were left out are named once.
-    let is_told = |message: &&String| left_out.iter().any(|of| message.contains(&of.reason));
-    let doubts = solution.warnings.iter().filter(|m| !is_told(m)).map(doubt).collect();
+    let doubts = solution.warnings.iter().filter(is_new).map(doubt).collect();
     let confidence = Some(confidence);
     let cameras = CamerasReport { source: CamerasSource::Solved, confidence, placed, left_out };
     Ok(Confirmed { photos: posed, cameras, doubts })
