@@ -180,7 +180,8 @@ async fn a_replica_killed_under_load_fails_its_own_calls_once_and_its_scenes_are
                         }
                         failed.fetch_add(usize::from(pause == 0), Ordering::AcqRel);
                     }
-                    assert!(got.as_ref() == Some(first), "{url} changed or does not come back");
+                    let got = got.unwrap_or_else(|| panic!("{url} does not come back"));
+                    assert!(got == *first, "{url} changed");
                 }
             })
         })
