@@ -2,9 +2,10 @@
 //! its place in one step.
 //!
 //! It goes behind everything else: before each step it waits until no other job waits or runs and
-//! no view was drawn for a moment. Where views never end it has a fourth of the time. It holds no
-//! slot and no room. Where no device draws it has a share of the threads, of low priority.
-//! What it still has to do is in the record, so that a start begins it again.
+//! no view was drawn for a moment. Where views never end it has a fourth of a device's time, and
+//! less of a processor's (`refiner.rs`). It holds no slot and no room. Where no device draws it has
+//! a share of the threads, of low priority. What it still has to do is in the record, so that a
+//! start begins it again.
 
 use std::{
     sync::Arc,

@@ -21,12 +21,15 @@ use object_store::{
     Error as Fault, ObjectMeta, ObjectStore, ObjectStoreExt, PutMode, PutOptions, PutPayload,
     path::Path,
 };
+use parking_lot::Mutex;
 use tokio::runtime::Runtime;
 
 use crate::error::{Error, ErrorCode, Result};
 
 /// Calls to the store at the same time where many objects are read at once.
 const AT_ONCE: usize = 16;
+/// What a probe puts, as often as its size asks for.
+static ZEROS: [u8; 1 << 20] = [0; 1 << 20];
 /// How often a put to a local store is tried again because its folder was removed meanwhile.
 const FOLDER_GONE_MAX: usize = 4;
 
@@ -64,6 +67,8 @@ pub(super) struct Objects {
     /// Runs the calls; taken when dropped.
     runtime: Option<Runtime>,
     timeout: Duration,
+    /// Held by the one call of [`Self::probe`] at a time.
+    looking: Mutex<()>,
     /// Bytes of the largest object that was not kept; 0 once as many were kept again.
     refused: AtomicUsize,
 }
@@ -96,7 +101,8 @@ impl Objects {
             .build()
             .map_err(|e| Error::internal("the store's threads do not start").caused_by(e))?;
         let (own, refused) = (folder.as_deref().and_then(folder_id), AtomicUsize::new(0));
-        Ok(Self { store, folder, own, runtime: Some(runtime), timeout, refused })
+        let looking = Mutex::default();
+        Ok(Self { store, folder, own, runtime: Some(runtime), timeout, looking, refused })
     }
 
     /// Fails where a local store is not the folder of the start any more. One that was moved away
@@ -189,8 +195,14 @@ impl Objects {
     pub(super) fn probe(&self, path: Path) -> Result<()> {
         let refused = self.refused.load(Ordering::Acquire);
         let size = if self.folder.is_some() { refused } else { refused.min(1) };
-        let (what, zeros) = ("keep anything", vec![0_u8; size]);
-        self.put(what, path.clone(), zeros)?;
+        let what = "keep anything";
+        // Each caller of a full store may ask: one look at a time, and no memory for it.
+        let Some(_looking) = self.looking.try_lock() else {
+            return Err(unavailable(what, fault("another call looks")));
+        };
+        let piece = |at| PutPayload::from_static(&ZEROS[..ZEROS.len().min(size - at)]);
+        let zeros = (0..size).step_by(ZEROS.len()).flat_map(piece);
+        self.put(what, path.clone(), zeros.collect::<PutPayload>())?;
         self.delete(what, path)?;
         self.forget_refused();
         Ok(())
