@@ -39,14 +39,12 @@ async function clicked(event) {
   if (!found.point) return told(t('pick.nothing'));
   if (state.measuring) return mark(found.point);
   const fits = found.labels.filter(({ relevancy }) => relevancy >= 0.5).slice(0, 3);
+  const nameless = state.understood ? t('pick.nameless') : t('pick.later');
   told(
-    [
-      state.understood ? t(fits.length ? 'pick.like' : 'pick.nameless') : t('pick.later'),
-      t('pick.far', { depth: lengthOf(found.depth) }),
-    ].join(' '),
+    [t('pick.far', { depth: lengthOf(found.depth) }), ...(fits.length ? [] : [nameless])].join(' '),
   );
   if (found.entry) await select(found.point, found.entry, more);
-  if (fits.length) $('picked').firstChild.after(...fits.map(offer), ' ');
+  if (fits.length) $('picked').append(t('pick.like'), ...fits.map(offer));
   const measure = make('button', { type: 'button', textContent: t('measure.here') });
   measure.onclick = () => {
     press('measure', 'measuring');

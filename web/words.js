@@ -242,7 +242,7 @@ const TABLE = {
   thing: ['thing {n}', 'Ding {n}', '物体 {n}'],
   clicked: ['clicked', 'angeklickt', '已点选'],
   'pick.nothing': ['Nothing is there.', 'Dort ist nichts.', '那里什么也没有。'],
-  'pick.like': ['This looks like: ', 'Das sieht aus wie: ', '看起来像：'],
+  'pick.like': [' This looks like: ', ' Das sieht aus wie: ', ' 看起来像：'],
   'pick.nameless': [
     'No name of the list fits.',
     'Kein Name der Liste passt.',
