@@ -162,7 +162,7 @@ class Shown:
 STYLE = """:root{color-scheme:light dark}body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;
 max-width:72rem;padding:0 1rem}div{display:flex;flex-wrap:wrap;gap:1rem}figure{margin:0}
 img{width:20rem;max-width:100%;border-radius:8px;display:block}h2{margin-top:3rem}
-figcaption,p{max-width:60rem}"""
+figcaption{max-width:20rem}p{max-width:60rem}"""
 
 
 def page(shown: list[Shown], out: Path) -> Path:
