@@ -44,18 +44,22 @@ def test_the_first_version_is_shown_again_with_what_was_gained(
         route.fulfill(json=scene)
 
     page.route(f"**/v1/scenes/{splats}", refined)
-    page.route("**/events", lambda route: route.fulfill(
-        body=lines, headers={"content-type": "text/event-stream"}))
+    held: list[Route] = []
+    page.route("**/events", lambda route: held.append(route))
     page.goto(f"{url}/#scene={splats}")
+    settled(page)
+    page.evaluate("segsplat.state.scene.first = true")
+    while not held:
+        page.wait_for_timeout(50)
+    held[0].fulfill(body=lines, headers={"content-type": "text/event-stream"})
     expect(page.locator("#says")).to_have_text("A better version: 40 Gaussians")
     settled(page)
     page.click("#report summary")
     expect(page.locator("#gain-says")).to_contain_text("21.0 → 25.0 dB")
-    page.evaluate("segsplat.state.scene.newest = true")
     before = page.locator("#before")
     for pressed in ["true", "false"]:
         before.click()
         expect(before).to_have_attribute("aria-pressed", pressed)
         settled(page)
-        assert page.evaluate("Boolean(segsplat.state.scene.newest)") == (pressed == "false")
+        assert page.evaluate("Boolean(segsplat.state.scene.first)") == (pressed == "true")
         assert pixels(page).std() > 10, "the canvas is flat"
