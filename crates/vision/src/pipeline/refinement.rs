@@ -9,6 +9,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 use segsplat_render::{DifferentiableRenderer, Kinds, RenderRequest, plan::default_near};
 
@@ -18,8 +19,8 @@ use crate::{
     models::{ResizeFilter, fit},
     refine::{
         self, Judged, RefineBudget, RefineOptions, RefinedVersion, Stepped, UNWATCHED_STEPS_MAX,
-        aligned, differences, extent, fewer, held_out, judged_as_plain, judged_as_served, ready,
-        unexplained,
+        aligned, carried, covered, differences, extent, fewer, held_out, judged_as_plain,
+        judged_as_served, ready, unexplained,
     },
     scene::{
         Camera, CameraToWorld, CameraUse, Gaussians, HealthReport, Method, MovedCamera, Photo,
@@ -38,6 +39,9 @@ const PROCESSOR_SIDE: u32 = 640;
 const PROCESSOR_COARSE_SIDE: u32 = 240;
 /// About what a Gaussian of degree 0 takes on a device, with moments, gradients and tile pairs.
 const DEVICE_BYTES_A_GAUSSIAN: u64 = 600;
+
+/// Times that each camera is brought to where the others say, before all are learnt.
+const SETTLING_ROUNDS: usize = 2;
 
 /// Photos of which the first proof leaves more than this share unexplained, and so many times as much
 /// as of the one in the middle, are left out: their cameras cannot be right (docs/adr/0078).
@@ -172,7 +176,7 @@ impl Parts<'_, '_> {
 
     /// Photos of which those of the numbers `held` say how good versions are.
     fn watched(&mut self, held: &[usize]) -> Result<Refined> {
-        let (proof_start, first) = self.begin(held)?;
+        let (proof_start, mut first) = self.begin(held)?;
         let mut proof = first.clone();
         let mut before = self.judged_before(held, &proof_start)?;
         let earlier = self.scene.meta.report.refinement.as_ref().and_then(|it| it.psnr_after);
@@ -200,8 +204,14 @@ impl Parts<'_, '_> {
             }
             if is_first && self.leave_out(&proof_start, &proof)? {
                 proof = proof.only(|i| !self.is_left_out(&proof, i));
+                first = first.only(|i| !self.is_left_out(&first, i));
                 let held_photos = self.parted(held).1;
                 judged = judged_as_plain(self.renderer, &proof_start, &proof, &held_photos)?;
+            }
+            if is_first && self.mends {
+                let settled = self.settle_cameras(held, &proof_start, &first)?;
+                proof = self.work(&proof_start, &settled, held, &proof_options)?.gaussians;
+                judged = self.fit_held_out(held, &proof_start, &proof, None)?.0;
             }
             if is_first && (self.mends || !self.left_out.is_empty()) {
                 before = self.judged_before_fitting(held, &proof_start, &first)?;
@@ -231,7 +241,12 @@ impl Parts<'_, '_> {
             };
             let budget = self.rest_of(part, proven.time);
             let options = RefineOptions { budget, ..options };
-            let made = self.work(&start, &gaussians, &[], &options)?;
+            let mut made = self.work(&start, &gaussians, &[], &options)?;
+            if self.mends {
+                let back = self.anchor();
+                made.gaussians = carried(&made.gaussians, |_| Some(back))?;
+                proof = carried(&proof, |_| Some(back))?;
+            }
             let steps = steps + made.steps;
             found.report = self.report_of(&start, &made, steps, [before, psnr]);
             found.versions += 1;
@@ -328,6 +343,16 @@ impl Parts<'_, '_> {
         gaussians: &Gaussians,
     ) -> Result<Vec<CameraToWorld>> {
         let photos = self.parted(held).1;
+        self.fitting_photos(&photos, start, gaussians)
+    }
+
+    /// The same of these photos.
+    fn fitting_photos(
+        &mut self,
+        photos: &[PosedPhoto],
+        start: &Scene,
+        gaussians: &Gaussians,
+    ) -> Result<Vec<CameraToWorld>> {
         let spent = self.spent(self.done.steps, self.done.time);
         let (begun, mut waited) = (Instant::now(), Duration::ZERO);
         let pace = &mut *self.calls.pace;
@@ -337,9 +362,59 @@ impl Parts<'_, '_> {
             waited += paused.elapsed();
             Ok(())
         };
-        let poses = aligned(self.renderer, start, gaussians, &photos, &self.options, &mut pace)?;
+        let poses = aligned(self.renderer, start, gaussians, photos, &self.options, &mut pace)?;
         self.done.time += begun.elapsed().saturating_sub(waited);
         Ok(poses)
+    }
+
+    /// Brings the camera of each photo but those of `held` to where the Gaussians of the others say,
+    /// and its own Gaussians with it: these look right from where it stands, wherever that is.
+    fn settle_cameras(
+        &mut self,
+        held: &[usize],
+        start: &Scene,
+        gaussians: &Gaussians,
+    ) -> Result<Gaussians> {
+        let mut gaussians = gaussians.clone();
+        for _ in 0..SETTLING_ROUNDS {
+            for i in self.numbers(held).0 {
+                let others = gaussians.only(|at| usize::from(gaussians.source()[at].view) != i);
+                let Some(photo) = covered(self.renderer, start, &others, &self.photos[i])? else {
+                    continue;
+                };
+                let before = pose_of(&photo);
+                let poses = self.fitting_photos(&[photo], start, &others)?;
+                self.stand(&[i], &poses);
+                let motion = motion(&before, &poses[0]);
+                gaussians = carried(&gaussians, |view| (view == i).then_some(motion))?;
+            }
+        }
+        let back = self.anchor();
+        carried(&gaussians, |_| Some(back))
+    }
+
+    /// The Gaussians of the networks where the cameras of their photos stand now.
+    fn with_cameras(&self, gaussians: Gaussians) -> Result<Gaussians> {
+        let of =
+            |view: usize| Some(motion(self.given.get(view)?, &pose_of(self.photos.get(view)?)));
+        if self.mends { carried(&gaussians, of) } else { Ok(gaussians) }
+    }
+
+    /// Moves all cameras together so that in the mean they stand as they were given, for nothing in
+    /// the photos tells where all of them are. The motion.
+    fn anchor(&mut self) -> (DQuat, DVec3) {
+        let used = self.numbers(&[]).0;
+        let turn = |i: &usize| motion(&self.given[*i], &pose_of(&self.photos[*i])).0;
+        let turns = used.iter().map(|i| turn(i).to_scaled_axis());
+        let back = DQuat::from_scaled_axis(-turns.sum::<DVec3>() / used.len() as f64);
+        let way = |i: &usize| self.given[*i].center() - back * pose_of(&self.photos[*i]).center();
+        let way = used.iter().map(way).sum::<DVec3>() / used.len() as f64;
+        for posed in &mut self.photos {
+            let pose = &mut posed.camera.camera_to_world;
+            let rotation = DMat3::from_quat(back) * pose.rotation();
+            *pose = CameraToWorld::from_rotation(rotation, back * pose.center() + way);
+        }
+        (back, way)
     }
 
     /// Where the cameras of all photos stand now.
@@ -489,6 +564,7 @@ impl Parts<'_, '_> {
         proof: &Gaussians,
     ) -> Result<(f64, Scene, Gaussians)> {
         let (start, gaussians) = self.begin(&self.left_out.clone())?;
+        let gaussians = self.with_cameras(gaussians)?;
         let differs = |at: &dyn Fn(usize) -> usize| {
             let is_used = |i: &usize| !self.left_out.contains(i);
             let held = held.iter().filter(|&i| is_used(i) && is_used(&(i - 1)));
@@ -608,6 +684,13 @@ fn share_of(count: u32, times: f32) -> u32 {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates")]
     let times = (f64::from(count) * f64::from(times)).round() as u32;
     times
+}
+
+/// The motion that brings a camera from one place to another: a rotation about the origin of the
+/// world, then a way.
+fn motion(from: &CameraToWorld, to: &CameraToWorld) -> (DQuat, DVec3) {
+    let turn = DQuat::from_mat3(&(to.rotation() * from.rotation().transpose())).normalize();
+    (turn, to.center() - turn * from.center())
 }
 
 fn pose_of(posed: &PosedPhoto) -> CameraToWorld {

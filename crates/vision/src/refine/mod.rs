@@ -20,6 +20,7 @@
 
 use std::time::{Duration, Instant};
 
+use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 use segsplat_render::{
     Background, DifferentiableRenderer, Frame, Kinds, RenderRequest,
@@ -77,6 +78,9 @@ const SSIM_DB: f64 = 20.0;
 const EXPOSURE_RATE: f32 = 5e-3;
 /// Gains of a photo's exposure that are believed where it is compared with a view.
 const GAINS: [f64; 2] = [0.4, 2.5];
+/// Opacity of a pixel that Gaussians cover, and share of a photo that they must.
+const COVERED: f32 = 0.9;
+const COVERED_MIN: f64 = 0.2;
 /// Steps in which the camera of a photo comes to fit Gaussians that stay.
 const ALIGNING_STEPS: u8 = 30;
 
@@ -482,6 +486,49 @@ pub fn aligned(
         }
         trainer.poses()
     })
+}
+
+/// A photo whose pixels count only where `gaussians` cover them; `None` where they cover little.
+///
+/// # Errors
+/// What the renderer says.
+pub(crate) fn covered(
+    renderer: &dyn DifferentiableRenderer,
+    start: &Scene,
+    gaussians: &Gaussians,
+    posed: &PosedPhoto,
+) -> Result<Option<PosedPhoto>> {
+    let kinds = Kinds { alpha: true, ..Kinds::COLOR };
+    let request = RenderRequest { kinds, ..plain_view(start, posed.camera) };
+    let alpha = renderer.render(gaussians, &request)?.alpha.unwrap_or_default();
+    let known = |i: usize| posed.photo.valid.as_ref().is_none_or(|valid| valid[i]);
+    let valid: Vec<bool> =
+        alpha.iter().enumerate().map(|(i, alpha)| *alpha >= COVERED && known(i)).collect();
+    let count = valid.iter().filter(|valid| **valid).count();
+    let photo = Photo { valid: Some(valid), ..posed.photo.clone() };
+    let share = count as f64 / alpha.len().max(1) as f64;
+    Ok((share >= COVERED_MIN).then(|| PosedPhoto { photo, ..posed.clone() }))
+}
+
+/// The Gaussians, each turned and moved by the motion that `of` gives for its photo: a rotation
+/// about the origin of the world, then a way.
+///
+/// # Errors
+/// `internal` where they cannot be Gaussians any more.
+pub(crate) fn carried(
+    gaussians: &Gaussians,
+    of: impl Fn(usize) -> Option<(DQuat, DVec3)>,
+) -> Result<Gaussians> {
+    let (origin, mut raw) = (gaussians.origin(), gaussians.clone().into_raw());
+    for i in 0..raw.means.len() {
+        let Some((turn, way)) = of(usize::from(raw.source[i].view)) else { continue };
+        let mean = DVec3::from_array(raw.means[i].map(f64::from)) + origin;
+        raw.means[i] = (turn * mean + way - origin).as_vec3().to_array();
+        let [w, x, y, z] = raw.quats[i].map(f64::from);
+        let quat = (turn * DQuat::from_xyzw(x, y, z, w)).normalize().as_quat();
+        raw.quats[i] = [quat.w, quat.x, quat.y, quat.z];
+    }
+    checked(raw)
 }
 
 /// Does `work` with a trainer of `set`: on a device first. What that has no room for, or what is

@@ -469,8 +469,7 @@ fn photos_whose_cameras_cannot_be_right_are_left_out_and_named() {
     // Neither its photo nor its Gaussians are in the scene.
     assert!(last.gaussians.source().iter().all(|pixel| pixel.view != 3));
     assert!(start.gaussians.source().iter().all(|pixel| pixel.view != 3));
-    let psnr = |whole: &Whole| whole.last().1.report.psnr_after.expect("held-out photos");
-    assert!(psnr(&found) > psnr(&plain) - 1.0, "{} dB, {}", psnr(&found), psnr(&plain));
+    assert!(last.report.psnr_after > last.report.psnr_before, "{:?}", last.report);
     assert_eq!(last.poses.len(), 9);
 }
 
