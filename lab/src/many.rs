@@ -4,7 +4,7 @@
 //! Every sixth photo from the fourth is a target. N of the others, spread evenly, are given. Views
 //! are whole photos of one set of Gaussians over the backdrop, without layers.
 
-use std::{path::PathBuf, sync::Arc, time::Instant};
+use std::{cell::RefCell, path::PathBuf, sync::Arc, time::Instant};
 
 use glam::DVec3;
 use segsplat_testing::scenes::Random;
@@ -20,7 +20,7 @@ use crate::{
         Pipeline,
         refinement::{RefineCalls, refined},
     },
-    refine::{RefinedVersion, aligned, held_out},
+    refine::{ALIGNING_STEPS, RefinedVersion, aligned, held_out},
     refinements::Variant,
     render::{
         Background, Frame, Kinds, RenderRequest, Switches,
@@ -29,7 +29,7 @@ use crate::{
     },
     rows::{Rows, ms, progress},
     scene::{Camera, CameraToWorld, Gaussians, PosedPhoto, Scene, SceneOptions},
-    scenes::{is_posed, make_for_refinement, make_keeping, scene_of, use_of, view_request},
+    scenes::{is_posed, make_for_refinement, make_keeping, recast, scene_of, use_of, view_request},
     setup::Inputs,
 };
 
@@ -136,8 +136,19 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             }
             for (text, variant) in &variants {
                 let mut row = plain.clone();
+                // With the cameras that the photos have now.
+                let made_of = RefCell::new((given.clone(), seen.clone()));
                 let mut remake = |held: &[usize]| {
-                    Ok(variant.start(make_for_refinement(&engine, &given, held, &seen)?))
+                    let (photos, seen) = &*made_of.borrow();
+                    Ok(variant.start(make_for_refinement(&engine, photos, held, seen)?))
+                };
+                let mut recast = || {
+                    let Some((found, seen)) = recast(&engine, &given, &scene_options)? else {
+                        return Ok(None);
+                    };
+                    let poses = poses_of(&found);
+                    *made_of.borrow_mut() = (found, seen);
+                    Ok(Some(poses))
                 };
                 let mut paces = 0_u32;
                 let mut pace = |_: f32| {
@@ -155,7 +166,15 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
                 // Where the cameras of all photos have moved together, so must those of targets.
                 let fitted = |gaussians: &Gaussians| -> Result<Value> {
                     let no_wait = &mut || Ok(());
-                    let poses = aligned(renderer, &scene, gaussians, &targets, &options, no_wait)?;
+                    let poses = aligned(
+                        renderer,
+                        &scene,
+                        gaussians,
+                        &targets,
+                        &options,
+                        ALIGNING_STEPS,
+                        no_wait,
+                    )?;
                     let stand = |(target, pose): (&PosedPhoto, CameraToWorld)| {
                         let camera = Camera { camera_to_world: pose, ..target.camera };
                         PosedPhoto { camera, ..target.clone() }
@@ -166,8 +185,12 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
                         mean_ssim(&targets, |camera| one_set(gaussians, camera))?,
                     ]))
                 };
-                let calls =
-                    RefineCalls { remake: &mut remake, pace: &mut pace, publish: &mut publish };
+                let calls = RefineCalls {
+                    remake: &mut remake,
+                    recast: &mut recast,
+                    pace: &mut pace,
+                    publish: &mut publish,
+                };
                 let found = refined(renderer, &scene, &given, &options, calls)?;
                 let refine_ms = ms(begun);
                 row["refine"] = json!(text);
@@ -196,6 +219,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
                     row["refined_ssim"] = json!(similarity(&version.gaussians)?);
                     row["fitted"] = fitted(&version.gaussians)?;
                     row["off_degrees"] = json!(off_degrees(&version.poses, &right));
+                    row["off_recast"] = json!(off_degrees(&poses_of(&made_of.borrow().0), &right));
                     row["off_degrees_given"] = json!(off_degrees(&poses_of(&given), &right));
                     picture(text, one_set(&version.gaussians, camera)?)?;
                 }

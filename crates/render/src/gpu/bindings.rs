@@ -120,8 +120,8 @@ fn bound(kernel: Kernel) -> &'static [Bound] {
     use Bound::{
         Backdrops, Blocks, ByPictures, ByWindows, Colors, Dispatch, Earlier, Ends, Entries,
         Exposures, Footprints, Gaussians, Gradients, Lists, Moments, Nothing, Order, Pairs,
-        Partials, Photos, Pictures, Plans, PoseSums, Rows, Sh, Shaded, Slots, Sources, Starts, Sums, Table,
-        Touched, Training, Views,
+        Partials, Photos, Pictures, Plans, PoseSums, Rows, Sh, Shaded, Slots, Sources, Starts,
+        Sums, Table, Touched, Training, Views,
     };
     match kernel {
         Kernel::Cull => &[Views, Blocks, Order, Plans, Rows, Dispatch],

@@ -18,9 +18,9 @@ use crate::{
     error::Result,
     models::{ResizeFilter, fit},
     refine::{
-        self, Judged, RefineBudget, RefineOptions, RefinedVersion, Stepped, UNWATCHED_STEPS_MAX,
-        aligned, carried, covered, differences, extent, fewer, held_out, judged_as_plain,
-        judged_as_served, ready, unexplained,
+        self, ALIGNING_STEPS, Judged, RefineBudget, RefineOptions, RefinedVersion, Stepped,
+        UNWATCHED_STEPS_MAX, aligned, carried, covered, differences, extent, fewer, held_out,
+        judged_as_plain, judged_as_served, ready, unexplained,
     },
     scene::{
         Camera, CameraToWorld, CameraUse, Gaussians, HealthReport, Method, MovedCamera, Photo,
@@ -43,8 +43,8 @@ const DEVICE_BYTES_A_GAUSSIAN: u64 = 600;
 /// Times that each camera is brought to where the others say, before all are learnt.
 const SETTLING_ROUNDS: usize = 2;
 
-/// Photos of which the first proof leaves more than this share unexplained, and so many times as much
-/// as of the one in the middle, are left out: their cameras cannot be right (docs/adr/0078).
+/// Photos of which the first proof leaves more than this share unexplained, and so many times as
+/// much as of the one in the middle, are left out: their cameras cannot be right (docs/adr/0078).
 const LEFT_OUT_FROM: f64 = 0.75;
 const LEFT_OUT_FACTOR: f64 = 2.0;
 
@@ -75,6 +75,9 @@ pub type Remake<'a> = &'a mut dyn FnMut(&[usize]) -> Result<(Reconstruction, Gau
 pub struct RefineCalls<'a> {
     /// The scene without some photos, and the same as one set. The last call is that of all photos.
     pub remake: Remake<'a>,
+    /// Finds where the cameras stand by other means than steps, and has the networks run with them:
+    /// what `remake` gives from then on is of these. `None`: nothing is found, and nothing changes.
+    pub recast: &'a mut dyn FnMut() -> Result<Option<Vec<CameraToWorld>>>,
     /// Gets the share of the budget that is spent, 0..1, before each step, and may wait.
     pub pace: &'a mut dyn FnMut(f32) -> Result<()>,
     /// Gets each version that is better than the one before, with the scene that it began with.
@@ -118,18 +121,18 @@ pub fn refined(
     };
     let options = RefineOptions { pose_rate, ..options };
     let sized = photos.par_iter().map(|photo| at_side(photo, options.side)).collect();
-    let (done, given) = (Work::default(), photos.iter().map(pose_of).collect());
-    let left_out = Vec::new();
+    let given: Vec<CameraToWorld> = photos.iter().map(pose_of).collect();
     let mut parts = Parts {
         renderer,
         scene,
         photos: sized,
+        made: given.clone(),
         given,
         mends: false,
-        left_out,
+        left_out: Vec::new(),
         options,
         calls,
-        done,
+        done: Work::default(),
     };
     if held.is_empty() { parts.unwatched() } else { parts.watched(&held) }
 }
@@ -149,6 +152,8 @@ struct Parts<'a, 'c> {
     photos: Vec<PosedPhoto>,
     /// Where their cameras stood.
     given: Vec<CameraToWorld>,
+    /// Where those stood that the Gaussians of the networks were made with.
+    made: Vec<CameraToWorld>,
     /// Whether cameras are learnt.
     mends: bool,
     /// Photos whose cameras cannot be right.
@@ -176,7 +181,7 @@ impl Parts<'_, '_> {
 
     /// Photos of which those of the numbers `held` say how good versions are.
     fn watched(&mut self, held: &[usize]) -> Result<Refined> {
-        let (proof_start, mut first) = self.begin(held)?;
+        let (mut proof_start, mut first) = self.begin(held)?;
         let mut proof = first.clone();
         let mut before = self.judged_before(held, &proof_start)?;
         let earlier = self.scene.meta.report.refinement.as_ref().and_then(|it| it.psnr_after);
@@ -209,6 +214,12 @@ impl Parts<'_, '_> {
                 judged = judged_as_plain(self.renderer, &proof_start, &proof, &held_photos)?;
             }
             if is_first && self.mends {
+                if let Some(poses) = (self.calls.recast)()? {
+                    self.stand_all(&poses);
+                    self.made.clone_from(&poses);
+                    (proof_start, first) = self.begin(held)?;
+                    first = first.only(|i| !self.is_left_out(&first, i));
+                }
                 let settled = self.settle_cameras(held, &proof_start, &first)?;
                 proof = self.work(&proof_start, &settled, held, &proof_options)?.gaussians;
                 judged = self.fit_held_out(held, &proof_start, &proof, None)?.0;
@@ -354,6 +365,9 @@ impl Parts<'_, '_> {
         gaussians: &Gaussians,
     ) -> Result<Vec<CameraToWorld>> {
         let spent = self.spent(self.done.steps, self.done.time);
+        // Not more than was worked so far.
+        let most = self.done.steps / u32::try_from(photos.len().max(1)).unwrap_or(u32::MAX);
+        let steps = u8::try_from(most).unwrap_or(u8::MAX).clamp(1, ALIGNING_STEPS);
         let (begun, mut waited) = (Instant::now(), Duration::ZERO);
         let pace = &mut *self.calls.pace;
         let mut pace = || {
@@ -362,7 +376,8 @@ impl Parts<'_, '_> {
             waited += paused.elapsed();
             Ok(())
         };
-        let poses = aligned(self.renderer, start, gaussians, photos, &self.options, &mut pace)?;
+        let poses =
+            aligned(self.renderer, start, gaussians, photos, &self.options, steps, &mut pace)?;
         self.done.time += begun.elapsed().saturating_sub(waited);
         Ok(poses)
     }
@@ -395,8 +410,7 @@ impl Parts<'_, '_> {
 
     /// The Gaussians of the networks where the cameras of their photos stand now.
     fn with_cameras(&self, gaussians: Gaussians) -> Result<Gaussians> {
-        let of =
-            |view: usize| Some(motion(self.given.get(view)?, &pose_of(self.photos.get(view)?)));
+        let of = |view: usize| Some(motion(self.made.get(view)?, &pose_of(self.photos.get(view)?)));
         if self.mends { carried(&gaussians, of) } else { Ok(gaussians) }
     }
 

@@ -82,7 +82,7 @@ const GAINS: [f64; 2] = [0.4, 2.5];
 const COVERED: f32 = 0.9;
 const COVERED_MIN: f64 = 0.2;
 /// Steps in which the camera of a photo comes to fit Gaussians that stay.
-const ALIGNING_STEPS: u8 = 30;
+pub const ALIGNING_STEPS: u8 = 30;
 
 /// How long to refine: until either is spent. With steps alone the result is the same on every
 /// machine with the same lanes.
@@ -449,8 +449,8 @@ pub fn refine(
 }
 
 /// Where the cameras of photos stand so that they come closest to what `gaussians` show, over what
-/// is behind those of `start`: after a few steps that move nothing else. `pace` is called before
-/// each.
+/// is behind those of `start`: after so many steps for each that move nothing else. `pace` is called
+/// before each step.
 ///
 /// # Errors
 /// What the renderer or `pace` says.
@@ -460,6 +460,7 @@ pub fn aligned(
     gaussians: &Gaussians,
     photos: &[PosedPhoto],
     options: &RefineOptions,
+    steps: u8,
     pace: &mut dyn FnMut() -> Result<()>,
 ) -> Result<Vec<CameraToWorld>> {
     if photos.is_empty() || gaussians.is_empty() {
@@ -471,8 +472,8 @@ pub fn aligned(
     let set = TrainingSet { gaussians, photos, ssim_share, gaussians_max };
     let poses = pose_rates(start, options);
     with_trainer(renderer, &set, options, |trainer| {
-        for turn in 0..ALIGNING_STEPS {
-            let fall = LAST_RATE.powf(f32::from(turn) / f32::from(ALIGNING_STEPS));
+        for turn in 0..steps {
+            let fall = LAST_RATE.powf(f32::from(turn) / f32::from(steps));
             let step = TrainingStep {
                 rates: options.rates.scaled(0.0),
                 exposure: EXPOSURE_RATE,

@@ -256,7 +256,8 @@ fn refined_whole(
         Ok(())
     };
     let pace = &mut |_: f32| Ok(());
-    let calls = RefineCalls { remake: &mut remake, pace, publish: &mut publish };
+    let recast = &mut || Ok(None);
+    let calls = RefineCalls { remake: &mut remake, recast, pace, publish: &mut publish };
     let found = refinement::refined(renderer, &scene, photos, options, calls);
     Whole { found: found.expect("refined"), versions }
 }
