@@ -12,6 +12,7 @@ mod networks;
 pub mod refinement;
 pub mod semantics;
 mod sets;
+pub mod words;
 
 pub use self::{
     loader::PipelineLoader,
