@@ -95,6 +95,9 @@ impl Pipeline {
         {
             pipeline.masks()?;
             pipeline.image_text()?;
+            if pipeline.bundle.text_masks().is_some() {
+                pipeline.text_masks()?;
+            }
         }
         Ok(pipeline)
     }
