@@ -130,6 +130,20 @@ pub trait SceneNetworks: Send + Sync {
         let one_set = made.gaussians.clone();
         Ok((made, one_set))
     }
+
+    /// The photos with cameras that their keypoints tell, and what the networks say of them there;
+    /// `None` where nothing tells.
+    ///
+    /// # Errors
+    /// As [`Self::make`].
+    fn recast(
+        &self,
+        _photos: &[PosedPhoto],
+        _options: &SceneOptions,
+        _watch: Watch<'_>,
+    ) -> Result<Option<(Vec<PosedPhoto>, Seen)>> {
+        Ok(None)
+    }
 }
 
 /// What the bundle compares texts with, and how.
@@ -320,6 +334,15 @@ impl SceneNetworks for PipelineNetworks {
         let lacks = || Error::internal("what the networks said of the photos is not here");
         let seen = seen.ok_or_else(lacks)?;
         pipeline::make_for_refinement(self.0.get()?, &photos.photos, held, seen, watch)
+    }
+
+    fn recast(
+        &self,
+        photos: &[PosedPhoto],
+        options: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<Option<(Vec<PosedPhoto>, Seen)>> {
+        pipeline::recast(self.0.get()?, photos, options, watch)
     }
 }
 
