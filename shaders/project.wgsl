@@ -98,7 +98,7 @@ fn project_one(i: u32) -> Footprint {
         opacity -= (1.0 - sqrt(learnt_x / given_x)) * (opacity - ALPHA_MIN);
     }
     if sum > 0.0 {
-        opacity = min(opacity, ALPHA_MAX);
+        opacity = min(opacity, sqrt(opacity));
     }
     if !(opacity >= ALPHA_MIN) {
         return footprint;

@@ -1,4 +1,4 @@
-//! Merged Gaussians: one that stands for up to eight neighbours where a view shows them smaller
+//! Merged Gaussians: one that stands for up to four neighbours where a view shows them smaller
 //! than a part of a pixel.
 //!
 //! **What it keeps.** With weights `w`, the mean and the covariance of the mixture of its members
@@ -9,7 +9,9 @@
 //! opacity of 1 has room for: `S` is larger by that factor then. Two
 //! numbers are kept for that: the opacity `o` for `b = 0`, and the sum `q` of the `o_i`
 //! ([`Merged::sums`]). If members are smaller than it by one share and have its shape, that share
-//! of its covariance is `o / q`, and the right side is `√(o² det S + o q b tr S + q² b²)`.
+//! of its covariance is `o / q`, and the right side is `√(o² det S + o q b tr S + q² b²)`. Where
+//! the blur makes more than 1 of it, its root is drawn: n Gaussians in one place cover
+//! `1 - (1 - a)^n`, which is flat in the middle and no wider at its foot than one of them.
 //!
 //! Weights are `o (area + v)`: what a member adds to a picture that is blurred by the variance `v`
 //! of their centres.
@@ -32,7 +34,7 @@ use crate::{
 };
 
 /// Most Gaussians that one stands for.
-pub const GROUP: usize = 8;
+pub const GROUP: usize = 4;
 /// Largest [`crate::RenderRequest::detail`], pixels.
 pub const DETAIL_MAX: f32 = 16.0;
 /// A group whose error is so many times that of the median of its block is halved.

@@ -321,7 +321,7 @@ fn splat_of(
         opacity -= (1.0 - (blurred(learnt) / det).sqrt()) * (opacity - least);
     }
     if sum > 0.0 {
-        opacity = opacity.min(f64::from(ALPHA_MAX));
+        opacity = opacity.min(opacity.sqrt());
     }
     if opacity < f64::from(ALPHA_MIN) {
         return None;

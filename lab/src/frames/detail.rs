@@ -6,7 +6,7 @@ use std::sync::Arc;
 use glam::DVec3;
 use serde_json::json;
 
-use super::{Args, Drawing, frontier::times, generated::scene};
+use super::{Args, frontier::times, generated::scene};
 use crate::{
     error::{Error, Result},
     render::{

@@ -14,7 +14,7 @@ use super::{
 };
 use crate::{
     RenderRequest, Source,
-    constants::{ALPHA_MAX, ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK, OWN_SIZE, PIXEL_PX2},
+    constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK, OWN_SIZE, PIXEL_PX2},
     merged::Merged,
     scene::Gaussians,
     view::View,
@@ -306,8 +306,8 @@ impl Block {
             }
             if merged {
                 let opacity = at(&self.opacity);
-                let over = opacity - opacity.min(number(f64::from(ALPHA_MAX)));
-                (opacity - over.only(stands)).put(&mut self.opacity, i);
+                let most = opacity.min(opacity.sqrt());
+                (opacity + (most - opacity).only(stands)).put(&mut self.opacity, i);
             }
             for (k, (center, slope)) in self.center.iter_mut().zip(slope).enumerate() {
                 let place = number(view.focal[k]) * slope + number(view.principal[k]);
