@@ -89,7 +89,8 @@ impl Merged {
                 None => (own.semantic_index()[id as usize], own.opacities()[id as usize]),
                 Some(at) => (entries[at], self.sums[at]),
             };
-            let entry = heaviest(self.group(at).iter().map(of));
+            let rows: Vec<(u16, f32)> = self.group(at).iter().map(of).collect();
+            let entry = heaviest(&rows);
             entries.push(entry);
         }
         let entries: Arc<[u16]> = entries.into();
@@ -99,9 +100,9 @@ impl Merged {
 }
 
 /// The entry with the largest sum, the lower one of equals.
-fn heaviest(group: impl Iterator<Item = (u16, f32)> + Clone) -> u16 {
-    let sum = |entry: u16| group.clone().filter(|row| row.0 == entry).map(|row| row.1).sum::<f32>();
-    let sums = group.clone().map(|row| (row.0, sum(row.0)));
+fn heaviest(rows: &[(u16, f32)]) -> u16 {
+    let sum = |entry: u16| rows.iter().filter(|row| row.0 == entry).map(|row| row.1).sum::<f32>();
+    let sums = rows.iter().map(|row| (row.0, sum(row.0)));
     let best = sums.max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
     best.map_or(0, |(entry, _)| entry)
 }

@@ -399,7 +399,7 @@ fn merged_gaussians_have_the_entry_with_most_opacity() {
         let mut sums = [0.0; 16];
         merged
             .group(at)
-            .into_iter()
+            .iter()
             .map(of)
             .for_each(|(entry, sum)| sums[usize::from(entry)] += sum);
         let most = sums.iter().copied().fold(0.0, f32::max);
