@@ -320,7 +320,7 @@ impl Door {
     }
 
     /// The same, and the bounds that the answer tells.
-    pub(crate) async fn bounded(&self, id: &str, ask: &Ask) -> Result<(Vec<u8>, Bounds), Fault> {
+    pub(crate) async fn bounded(&self, id: &str, ask: &Ask) -> Result<(Vec<u8>, Told), Fault> {
         match self {
             Self::Http { base, client } => {
                 let url = url(base, &format!("/v1/scenes/{id}/view"), &ask.pairs);
@@ -331,7 +331,7 @@ impl Door {
                     told.expect("a number")
                 };
                 let file = bytes(answer).await?;
-                Ok((file, Bounds { error: told("x-error"), detail: told("x-detail") }))
+                Ok((file, Told { error: told("x-error"), detail: told("x-detail") }))
             }
             Self::Grpc { client } => {
                 let request = pb::RenderViewRequest {
@@ -344,7 +344,7 @@ impl Door {
                 };
                 let view = client.clone().render_view(request).await.map_err(fault_of)?;
                 let view = view.into_inner();
-                let bounds = Bounds { error: view.error, detail: view.detail };
+                let bounds = Told { error: view.error, detail: view.detail };
                 Ok((view.data.to_vec(), bounds))
             }
         }
@@ -400,7 +400,7 @@ impl Door {
 
 /// How far a view may be from the exact one, as its answer tells.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Bounds {
+pub(crate) struct Told {
     pub(crate) error: f32,
     pub(crate) detail: f32,
 }
