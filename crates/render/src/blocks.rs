@@ -10,8 +10,8 @@
 //! Gaussians at each step and does without.
 //!
 //! A view with a permission for it ([`RenderRequest::detail`]) has merged Gaussians in place of
-//! those of blocks that are far away ([`crate::merged`]). They have blocks of their own, a tree over
-//! those of the scene: [`Blocks::detailed`] makes it, and [`Frustum::is_fine`] is the test.
+//! those of blocks that are far away ([`crate::merged`]). They have blocks of their own, a tree
+//! over those of the scene: [`Blocks::detailed`] makes it, and [`Frustum::is_fine`] is the test.
 
 use std::{
     ops::Range,
