@@ -1,21 +1,20 @@
 //! Which keypoints of two photos show the same thing: those whose descriptors are each other's most
 //! similar.
 
+use nalgebra::DMatrix;
+
 use crate::vectorised;
 
-/// Rows and columns of similarities that are computed together.
-const ROWS: usize = 4;
-const COLUMNS: usize = 16;
+/// Keypoints of the second photo that are compared together: their similarities stay in the cache.
+const TOGETHER: usize = 64;
 
 /// The descriptors of a photo's keypoints, laid out to be compared with those of others.
 #[derive(Clone, Debug)]
 pub struct Descriptors {
-    dim: usize,
-    count: usize,
-    /// `[count * dim]`, filled up with rows of 0 to whole [`ROWS`].
-    rows: Vec<f32>,
-    /// The same as `[count / COLUMNS, dim, COLUMNS]`, filled up with 0.
-    columns: Vec<f32>,
+    /// `[dim, count]`: each is a column.
+    columns: DMatrix<f32>,
+    /// `[count, dim]`: each is a row.
+    rows: DMatrix<f32>,
     /// Mean of all, `[dim]`.
     mean: Vec<f32>,
 }
@@ -33,19 +32,13 @@ impl Descriptors {
     /// `[N * dim]` descriptors of length 1.
     #[must_use]
     pub fn new(descriptors: &[f32], dim: usize) -> Self {
-        let count = descriptors.len() / dim.max(1);
-        let mut rows = descriptors.to_vec();
-        rows.resize(count.next_multiple_of(ROWS) * dim, 0.0);
-        let mut columns = vec![0.0; count.next_multiple_of(COLUMNS) * dim];
-        let mut mean = vec![0.0; dim];
-        for (i, row) in descriptors.chunks_exact(dim.max(1)).enumerate() {
-            let tile = i / COLUMNS * COLUMNS * dim;
-            for (k, value) in row.iter().enumerate() {
-                columns[tile + k * COLUMNS + i % COLUMNS] = *value;
-                mean[k] += value / count as f32;
-            }
-        }
-        Self { dim, count, rows, columns, mean }
+        let columns = DMatrix::from_column_slice(dim, descriptors.len() / dim.max(1), descriptors);
+        let mean = columns.column_mean().as_slice().to_vec();
+        Self { rows: columns.transpose(), columns, mean }
+    }
+
+    fn count(&self) -> usize {
+        self.columns.ncols()
     }
 
     /// How much two photos look alike: the larger the more.
@@ -58,66 +51,76 @@ impl Descriptors {
     /// the order of the first photo's keypoints.
     #[must_use]
     pub fn matched(&self, other: &Self, least: f32) -> Vec<KeypointPair> {
-        let mut best = Best::of(self.count, other.count);
-        vectorised(
-            #[inline(always)]
-            || self.compare(other, &mut best),
-        );
-        let mutual = |(i, &(similarity, j)): (usize, &(f32, usize))| {
-            let is_mutual = best.of_columns.get(j)?.1 == i;
-            let keypoints = [u32::try_from(i).ok()?, u32::try_from(j).ok()?];
+        let [of_these, of_others] = self.most_similar(other);
+        let mutual = |i: usize| {
+            let (j, similarity) = (of_these.places[i], of_these.cosines[i]);
+            let keypoints = [u32::try_from(i).ok()?, j];
+            let is_mutual = *of_others.places.get(j as usize)? == keypoints[0];
             (is_mutual && similarity > least).then_some(KeypointPair { keypoints, similarity })
         };
-        best.of_rows.iter().enumerate().filter_map(mutual).collect()
+        (0..self.count()).filter_map(mutual).collect()
     }
 
-    #[inline(always)]
-    fn compare(&self, other: &Self, best: &mut Best) {
-        let dim = self.dim;
-        for (at, rows) in self.rows.chunks_exact(ROWS * dim).enumerate() {
-            for (tile, columns) in other.columns.chunks_exact(COLUMNS * dim).enumerate() {
-                let mut sums = [[0.0_f32; COLUMNS]; ROWS];
-                for (k, column) in columns.as_chunks::<COLUMNS>().0.iter().enumerate() {
-                    for (r, sums) in sums.iter_mut().enumerate() {
-                        let value = rows[r * dim + k];
-                        for (sum, other) in sums.iter_mut().zip(column) {
-                            *sum += value * other;
-                        }
+    /// The most similar of the other's keypoints to each of these, and of these to each of the
+    /// other's.
+    fn most_similar(&self, other: &Self) -> [MostSimilar; 2] {
+        let mut of_these = MostSimilar::none(self.count());
+        let mut of_others = MostSimilar::none(0);
+        let mut cosines = DMatrix::zeros(self.count(), TOGETHER);
+        for first in (0..other.count()).step_by(TOGETHER).filter(|_| self.count() > 0) {
+            let columns = other.columns.columns(first, TOGETHER.min(other.count() - first));
+            cosines.columns_mut(0, columns.ncols()).gemm(1.0, &self.rows, &columns, 0.0);
+            let each = cosines.as_slice().chunks_exact(self.count()).take(columns.ncols());
+            vectorised(
+                #[inline(always)]
+                || {
+                    for (place, cosines) in (first as u32..).zip(each) {
+                        of_these.keep(cosines, place);
+                        of_others.add(cosines);
                     }
-                }
-                for (r, sums) in sums.iter().enumerate() {
-                    best.take(at * ROWS + r, tile * COLUMNS, sums);
-                }
-            }
+                },
+            );
         }
+        [of_these, of_others]
     }
 }
 
-/// The most similar column of each row and row of each column, with the cosine; of equal ones the
-/// first.
-struct Best {
-    of_rows: Vec<(f32, usize)>,
-    of_columns: Vec<(f32, usize)>,
+/// The most similar keypoint to each of some: its place and its cosine; of equal ones the first.
+struct MostSimilar {
+    cosines: Vec<f32>,
+    places: Vec<u32>,
 }
 
-impl Best {
-    fn of(rows: usize, columns: usize) -> Self {
-        let none = |count| vec![(f32::NEG_INFINITY, usize::MAX); count];
-        Self { of_rows: none(rows), of_columns: none(columns) }
+impl MostSimilar {
+    fn none(count: usize) -> Self {
+        Self { cosines: vec![f32::NEG_INFINITY; count], places: vec![u32::MAX; count] }
     }
 
+    /// Takes one more keypoint, with its cosine to each of these.
     #[inline(always)]
-    fn take(&mut self, row: usize, first: usize, sums: &[f32; COLUMNS]) {
-        let Some(of_row) = self.of_rows.get_mut(row) else { return };
-        let columns = self.of_columns.iter_mut().skip(first);
-        for (i, (sum, of_column)) in sums.iter().zip(columns).enumerate() {
-            if *sum > of_row.0 {
-                *of_row = (*sum, first + i);
-            }
-            if *sum > of_column.0 {
-                *of_column = (*sum, row);
+    fn keep(&mut self, cosines: &[f32], place: u32) {
+        let kept = self.cosines.iter_mut().zip(&mut self.places);
+        for ((kept, kept_place), cosine) in kept.zip(cosines) {
+            let is_larger = *cosine > *kept;
+            *kept = if is_larger { *cosine } else { *kept };
+            *kept_place = if is_larger { place } else { *kept_place };
+        }
+    }
+
+    /// Adds a keypoint, with its cosine to each of the others.
+    #[inline(always)]
+    fn add(&mut self, cosines: &[f32]) {
+        let mut lanes = [f32::NEG_INFINITY; 16];
+        let (whole, rest) = cosines.as_chunks::<16>();
+        for cosines in whole {
+            for (lane, cosine) in lanes.iter_mut().zip(cosines) {
+                *lane = if *cosine > *lane { *cosine } else { *lane };
             }
         }
+        let largest = lanes.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max);
+        let place = cosines.iter().position(|cosine| *cosine == largest);
+        self.cosines.push(largest);
+        self.places.push(place.map_or(u32::MAX, |place| place as u32));
     }
 }
 

@@ -4,7 +4,7 @@ use std::{
     io::{BufRead, BufReader, Read},
     net::TcpListener,
     path::PathBuf,
-    process::{Child, Command, Stdio},
+    process::{Child, ChildStdout, Command, Stdio},
 };
 
 use axum::{body::Body, extract::Request, response::IntoResponse};
@@ -36,6 +36,9 @@ impl Drop for Helper {
 /// An S3-compatible server with one empty bucket, which checks signatures.
 pub(crate) struct S3 {
     _server: Helper,
+    /// Held open: the harness of the server's test writes there after a minute, and ends where
+    /// nobody could read it.
+    _said: BufReader<ChildStdout>,
     pub(crate) url: String,
 }
 
@@ -94,12 +97,12 @@ impl S3 {
             .stderr(Stdio::null())
             .spawn()
             .expect("this binary starts");
-        let said = BufReader::new(server.stdout.take().expect("piped")).lines();
-        let mut url = said
-            .map_while(Result::ok)
-            .filter_map(|line| line.split_once(LISTENS).map(|(_, url)| url.to_owned()));
-        let url = url.next().expect("the S3 server says where it listens");
-        Self { _server: Helper(server), url }
+        let mut said = BufReader::new(server.stdout.take().expect("piped"));
+        let mut lines = said.by_ref().lines().map_while(Result::ok);
+        let url = lines
+            .find_map(|line| line.split_once(LISTENS).map(|(_, url)| url.to_owned()))
+            .expect("the S3 server says where it listens");
+        Self { _server: Helper(server), _said: said, url }
     }
 
     /// A replica with its scenes there.
