@@ -1,8 +1,8 @@
-// Stage 0: the Gaussians of the blocks that the view may show, in no order.
+// Stage 0: the Gaussians of the blocks that the view shows, in no order.
 // CPU: crates/render/src/cpu/cull.rs (in the order of the scene)
 
 @group(0) @binding(1) var<storage, read> blocks: array<Block>;
-// [N] Gaussians, block after block.
+// Gaussians, block after block; u32::MAX: none.
 @group(0) @binding(2) var<storage, read> order: array<u32>;
 @group(0) @binding(3) var<storage, read_write> plans: array<Plan>;
 // [views][blocks * BLOCK] Gaussians that are left.
@@ -39,6 +39,25 @@ fn may_show(block: Block) -> bool {
     return true;
 }
 
+// CPU: Frustum::is_fine
+fn is_fine(block: Block) -> bool {
+    let d = (block.center - views[which].center.xyz) - views[which].center_low.xyz;
+    let reached = block.half + ROUNDING * (abs(d) + block.half);
+    let axis = views[which].rotation_z.xyz;
+    let nearest = dot(axis, d) - dot(abs(axis), reached);
+    return block.error < 0.0
+        || (nearest >= views[which].near && block.error < views[which].detail * nearest);
+}
+
+// CPU: Blocks::is_shown
+fn is_shown(at: u32) -> bool {
+    let block = blocks[at];
+    if block.parent < views[which].block_count && is_fine(blocks[block.parent]) {
+        return false;
+    }
+    return is_fine(block) && may_show(block);
+}
+
 @compute @workgroup_size(256)
 fn main(
     @builtin(workgroup_id) group: vec3<u32>,
@@ -52,7 +71,7 @@ fn main(
     workgroupBarrier();
     let block = (group.y * groups.x + group.x) * TESTED + local;
     let count = views[which].block_count;
-    if local < TESTED && block < count && may_show(blocks[block]) {
+    if local < TESTED && block < count && is_shown(block) {
         shown[atomicAdd(&shown_count, 1u)] = block;
     }
     workgroupBarrier();
@@ -68,15 +87,8 @@ fn main(
         }
     }
     let first = workgroupUniformLoad(&held);
-    let total = views[which].gaussian_count;
     let to = which * count * BLOCK + first.x + local;
     for (var k = 0u; k < first.y; k++) {
-        let at = shown[k] * BLOCK + local;
-        // The last block may be shorter: what is past the last Gaussian is none.
-        var row = total;
-        if at < total {
-            row = order[at];
-        }
-        rows[to + k * BLOCK] = row;
+        rows[to + k * BLOCK] = order[shown[k] * BLOCK + local];
     }
 }

@@ -46,8 +46,9 @@ fn project_one(i: u32) -> Footprint {
     }
     var scale = gaussian.scale;
     var blur = Blur(0.0, BLUR_PX2, BLUR_PX2);
-    if gaussian.source < views[which].source_count {
-        let source = sources[views[which].source_start + gaussian.source];
+    let photo = gaussian.source & 0xffffu;
+    if photo < views[which].source_count {
+        let source = sources[views[which].source_start + photo];
         blur = blur_of(gaussian, source, t.z);
         if blur.lost > 0.0 {
             scale = sqrt(scale * scale + blur.lost);
@@ -79,12 +80,25 @@ fn project_one(i: u32) -> Footprint {
         return footprint;
     }
     var opacity = gaussian.opacity;
+    let sum = bitcast<f32>(gaussian.source & 0xffff0000u);
+    if sum > 0.0 && views[which].antialiased == 0u {
+        // What its members cover with the blur that they were learnt with
+        // (crates/render/src/merged.rs); all over var_y.
+        let learnt_x = sharp_x + blur.learnt * ((xx + blur.learnt) / var_y + yy / var_y);
+        let spread = sum * blur.learnt;
+        let covers = opacity * opacity * sharp_x
+            + spread * (opacity * (xx / var_y + yy / var_y) + spread / var_y);
+        opacity = sqrt(covers / learnt_x);
+    }
     if views[which].antialiased != 0u {
         opacity *= sqrt(sharp_x / given_x);
     } else if blur.learnt < BLUR_PX2 {
         // Its sum over the picture stays, less what is under the least alpha.
         let learnt_x = sharp_x + blur.learnt * ((xx + blur.learnt) / var_y + yy / var_y);
         opacity -= (1.0 - sqrt(learnt_x / given_x)) * (opacity - ALPHA_MIN);
+    }
+    if sum > 0.0 {
+        opacity = min(opacity, sqrt(opacity));
     }
     if !(opacity >= ALPHA_MIN) {
         return footprint;

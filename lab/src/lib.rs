@@ -84,6 +84,8 @@ enum Command {
     Aims(frames::Args),
     /// Time frames that may differ from the exact ones by so much
     Frontier(frames::frontier::FrontierArgs),
+    /// What a view from afar costs that may have merged Gaussians
+    Detail(frames::detail::DetailArgs),
     /// Ask a server for views and scenes, as its callers do
     #[command(subcommand)]
     Load(load::Command),
@@ -133,6 +135,7 @@ pub fn run(cli: &Cli) -> Result<Vec<serde_json::Value>> {
         Command::Skips(args) => frames::skips::run(args, &mut rows)?,
         Command::Aims(args) => frames::aims::run(args, &mut rows)?,
         Command::Frontier(args) => frames::frontier::run(args, &mut rows)?,
+        Command::Detail(args) => frames::detail::run(args, &mut rows)?,
         Command::Load(command) => load::run(command, &mut rows)?,
         Command::Bench(args) => bench::run(args, &cli.record)?,
         Command::Report(args) => report::run(args)?,

@@ -159,6 +159,11 @@ pub struct ViewOptions {
     /// (exact) to 32; left out: that of `quality`. Views with depth are exact.
     #[prost(float, optional, tag = "12")]
     pub error: ::core::option::Option<f32>,
+    /// Permission to draw one merged Gaussian for many that are far away, pixels: how far one may be
+    /// from the one that stands for it, 0 (none is merged) to 16. `error` does not count what they
+    /// change.
+    #[prost(float, tag = "13")]
+    pub detail: f32,
 }
 /// A part of a picture, pixels of the whole one.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1256,6 +1261,10 @@ pub struct View {
     /// Bound of its difference to the exact picture, levels of 255.
     #[prost(float, tag = "13")]
     pub error: f32,
+    /// How far a Gaussian is at most from the merged one that stands for it, pixels; 0: none is
+    /// merged.
+    #[prost(float, tag = "14")]
+    pub detail: f32,
 }
 /// Which scene to write, and how.
 #[derive(Clone, PartialEq, ::prost::Message)]

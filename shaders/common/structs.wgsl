@@ -83,8 +83,10 @@ struct View {
     photos_widen: f32,
     // Blocks of the scene; 0: every Gaussian is projected.
     block_count: u32,
+    // How far a Gaussian may be from the merged one that stands for it, for each unit of depth.
+    detail: f32,
     // Not used: a row has a multiple of four.
-    rest: vec2<u32>,
+    rest: u32,
 }
 
 // A photo that Gaussians were seen in.
@@ -107,8 +109,13 @@ struct Block {
     reach: f32,
     // Half the sides of the box.
     half: vec3<f32>,
+    // How far a Gaussian of the scene is at most from the one that stands for it here; under 0:
+    // they are the scene's own.
+    error: f32,
+    // The block of merged Gaussians that stands for this one, if there is one of that number.
+    parent: u32,
     // Not used.
-    rest: u32,
+    rest: array<u32, 3>,
 }
 
 struct Gaussian {
@@ -117,7 +124,8 @@ struct Gaussian {
     // wxyz, unit.
     quat: vec4<f32>,
     scale: vec3<f32>,
-    // Its photo.
+    // Its photo in the lower half. In the upper half that of an f32: opacities that it stands for,
+    // in sum, if it is merged; else 0.
     source: u32,
 }
 

@@ -45,6 +45,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let request = RenderRequest {
         antialiased: options.antialiased.unwrap_or(scene.meta.report.antialiased),
         error: options.error.0,
+        detail: options.detail,
         ..RenderRequest::plain(first.camera, Kinds { depth: false, ..Kinds::ALL }, near)
     };
     let mut times = Vec::new();

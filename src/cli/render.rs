@@ -73,6 +73,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         "format": view.format,
         "depth_scale": view.depth_scale,
         "error": view.error,
+        "detail": view.detail,
         "camera": view.camera,
         "renderer": service.renderer().name(),
         "render_ms": view.times.render_ms,

@@ -342,6 +342,11 @@ pub struct ViewOptions {
     #[param(value_type = String)]
     #[schema(value_type = serde_json::Value)]
     pub error: MaxError,
+    /// Permission to draw one merged Gaussian for many that are far away, pixels: how far one may
+    /// be from the one that stands for it, 0 (default: none is merged) to 16. `error` does not
+    /// count what they change. Scenes of 262,144 Gaussians and more have some.
+    #[arg(long, default_value_t = 0.0, value_name = "PIXELS")]
+    pub detail: f32,
     /// How it is drawn and texts are scored: `default` or `paper`. By default as the scene was
     /// made.
     #[arg(long, value_parser = named::<Preset>)]

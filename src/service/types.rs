@@ -204,8 +204,12 @@ pub struct RenderedView {
     pub bytes: Vec<u8>,
     /// World units of one step of a 16-bit depth PNG: depth = value * `depth_scale`.
     pub depth_scale: Option<f64>,
-    /// Bound of its difference to the exact picture, levels of 255; 0: it is exact.
+    /// Bound of its difference to the exact picture, levels of 255; 0: it is exact. Of merged
+    /// Gaussians it is that of theirs.
     pub error: f32,
+    /// How far a Gaussian is at most from the merged one that stands for it, pixels; 0: none is
+    /// merged.
+    pub detail: f32,
     /// Camera it was rendered with.
     pub camera: Camera,
     /// Hash of scene and request; equal tags mean equal bytes.
@@ -358,7 +362,8 @@ impl Default for CallerLimits {
 pub struct ModelInfo {
     /// What it does: `geometry`, `geometry.cpu`, `geometry.many`, `geometry.many.cpu`,
     /// `masks.encoder`, `masks.decoder`, `image_text.image`, `image_text.text`,
-    /// `image_text.tokenizer`, `image_text.words`, `features`.
+    /// `image_text.tokenizer`, `image_text.words`, `text_masks.image`, `text_masks.find`,
+    /// `text_masks.tokenizer`, `features`.
     pub name: String,
     /// File in the bundle.
     pub file: String,

@@ -33,6 +33,7 @@ use crate::{
     render::{
         self, Frame, Kinds, Labels, RenderRequest, Samples,
         budget::{bound, check_error},
+        merged::check_detail,
         plan::{self, NEAR_RANGE, ViewMethod, default_near},
     },
     scene::{Camera, Intrinsics, Method, Preset, Scene, SceneCamera, SceneId},
@@ -112,6 +113,7 @@ impl Resolved {
             antialiased: self.options.antialiased.unwrap_or(scene.meta.report.antialiased),
             near: self.near,
             error: self.options.error.0,
+            detail: self.options.detail,
         }
     }
 
@@ -225,6 +227,7 @@ impl Resolved {
                 bytes: encoded.bytes,
                 depth_scale: encoded.depth_scale,
                 error: bound(self.options.error.0, self.kinds()),
+                detail: self.options.detail,
                 camera: self.seen(),
                 etag: self.etag(&scene_tag(scene), &name, kind, &text)?,
                 stats: frame.stats,
@@ -345,6 +348,7 @@ fn resolve<'a>(
         None => default_near(inputs.median_depth),
     };
     check_error(options.error.0)?;
+    check_detail(options.detail)?;
     let (method, preset) = inputs.draw_method(options)?;
     let resolved = |(camera_index, spec)| {
         let what = match cameras.len() {
@@ -400,7 +404,7 @@ impl Shared {
 
     /// The text of a view, scored; `None` where the view needs no semantics.
     async fn score_ask(
-        &self,
+        self: &Arc<Self>,
         of: Option<SemanticScene>,
         ask: TextOptions,
         preset: Option<Preset>,

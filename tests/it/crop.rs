@@ -42,13 +42,20 @@ async fn both_doors_give_a_part_and_take_an_error() {
             let what = format!("{option}={value} by {name}");
             let (file, told) =
                 door.bounded(&id, &colors.clone().with(option, value)).await.expect(&what);
-            assert_eq!(told, levels, "{what}: the bound that is told");
+            assert_eq!(told.error, levels, "{what}: the bound that is told");
             for (got, want) in npy(&file).iter().zip(&exact) {
                 assert!((got - want).abs() <= levels / 255.0 + 1e-5, "{what}: {got}, not {want}");
             }
         }
         let (file, told) = door.bounded(&id, &ask.clone().with("error", "8")).await.expect("depth");
-        assert_eq!((told, npy(&file)), (0.0, whole), "depth is exact by {name}");
+        assert_eq!((told.error, npy(&file)), (0.0, whole), "depth is exact by {name}");
+        // A scene of few Gaussians has no merged ones.
+        let detail = colors.clone().with("detail", "0.75");
+        let (file, told) = door.bounded(&id, &detail).await.expect("a detail");
+        assert_eq!((told.error, told.detail), (0.0, 0.75), "the detail is told by {name}");
+        assert_eq!(npy(&file), exact, "nothing is merged by {name}");
+        let fault = door.view(&id, &detail.with("detail", "17")).await.expect_err("17 pixels");
+        assert_eq!(fault.message, "detail is 17; it must be 0 to 16 pixels", "17 by {name}");
         let fault = door.view(&id, &ask.with("error", "33")).await.expect_err("33 levels");
         assert_eq!(fault.code, "invalid_request", "33 by {name}");
         let told = "error is 33; it must be 0 to 32 levels of 255, exact (0) or fast (2)";

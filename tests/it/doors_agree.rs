@@ -64,7 +64,7 @@ const NOT_ON_THE_COMMAND_LINE: Absent = &[
 
 const NOT_ON_THE_PAGE: Absent = &[
     ("refine_scene", "it takes the machine for minutes: an operator or a program asks for it"),
-    ("render_view", "the page draws the scene itself"),
+    ("render_view.*", "a small picture of what a photo shows, as the server draws it"),
     ("render_views", "the page draws the scene itself"),
     ("features", "arrays are for programs"),
     ("*.deadline_ms", "whoever looks can go away"),

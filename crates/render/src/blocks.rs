@@ -8,16 +8,26 @@
 //!
 //! Blocks are made once a scene, when it is first drawn or uploaded. The backward pass has other
 //! Gaussians at each step and does without.
+//!
+//! A view with a permission for it ([`RenderRequest::detail`]) has merged Gaussians in place of
+//! those of blocks that are far away ([`crate::merged`]). They have blocks of their own, a tree
+//! over those of the scene: [`Blocks::detailed`] makes it, and [`Frustum::is_fine`] is the test.
 
-use std::sync::{Arc, Weak};
+use std::{
+    ops::Range,
+    sync::{Arc, Weak},
+};
 
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 use parking_lot::Mutex;
 use rayon::prelude::*;
 
 use crate::{
     RenderRequest, Source,
     constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK},
+    error::Result,
+    merged::{Merged, Merger, Part},
+    places::{Place, corners, split},
     scene::Gaussians,
     switches::{Skip, Switches},
     view::View,
@@ -27,8 +37,6 @@ use crate::{
 pub const BLOCK: usize = 256;
 /// Gaussians from which a scene has blocks: for fewer a view costs less than the test saves.
 pub const BLOCKS_MIN: usize = 1 << 18;
-/// Fewest Gaussians that a thread sorts by itself.
-const SPLIT_MIN: usize = 1 << 14;
 /// Rounding of the test, as a share of the numbers in it: over that of f32 on a device.
 pub(crate) const ROUNDING: f64 = 1e-5;
 /// Share by which reaches are taken larger, and pixels around the picture: over the slack of
@@ -36,31 +44,45 @@ pub(crate) const ROUNDING: f64 = 1e-5;
 const REACH_SLACK: f64 = 1.0001;
 const MARGIN_PX: f64 = 1.0;
 
-/// Where the Gaussians of a block are, and how far they reach: 32 bytes.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// No Gaussian, in the last places of a block that has fewer than [`BLOCK`]; no block.
+pub const NONE: u32 = u32::MAX;
+
+/// Where the Gaussians of a block are, and how far they reach.
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bounds {
-    /// Middle of the box of the centres, relative to the origin.
+    /// Middle of the box of the centres, relative to the origin: also of those of all Gaussians
+    /// that are merged in this block.
     pub center: [f32; 3],
     /// Half the sides of the box.
     pub half: [f32; 3],
     /// Largest scale.
     pub reach: f32,
+    /// How far a Gaussian of the scene is at most from the one that stands for it here, world
+    /// units: see [`crate::merged`]. Under 0: they are the scene's own.
+    pub error: f32,
+    /// The block of merged Gaussians that stands for this one and its neighbours, or [`NONE`].
+    pub parent: u32,
 }
 
-/// The blocks of a scene: 4.1 bytes a Gaussian.
+impl Default for Bounds {
+    fn default() -> Self {
+        let [center, half] = [[0.0; 3]; 2];
+        Self { center, half, reach: 0.0, error: -1.0, parent: NONE }
+    }
+}
+
+/// The blocks of a scene: 4.2 bytes a Gaussian.
 #[derive(Debug)]
 pub struct Blocks {
-    /// `[N]` Gaussians, block after block of [`BLOCK`]; those of a block ascend.
+    /// Gaussians, block after block of [`BLOCK`]; those of a block ascend, and [`NONE`] fills the
+    /// last one. Those that are merged count on after the scene's own.
     pub order: Vec<u32>,
     /// Of each block.
     pub bounds: Vec<Bounds>,
-}
-
-/// A centre with its number, for the sort.
-#[derive(Clone, Copy)]
-struct Place {
-    at: [f32; 3],
-    id: u32,
+    /// Number of blocks of the scene's own Gaussians, which come first.
+    pub own: usize,
+    /// The merged Gaussians, where there are some.
+    pub merged: Option<Arc<Merged>>,
 }
 
 impl Blocks {
@@ -69,64 +91,97 @@ impl Blocks {
     pub fn of(gaussians: &Gaussians) -> Self {
         let means = gaussians.means().par_iter().enumerate();
         let mut places: Vec<Place> = means.map(|(id, &at)| Place { at, id: id as u32 }).collect();
-        split(&mut places);
+        split(&mut places, BLOCK);
         let scales = gaussians.scales();
-        let bounds = places.par_chunks(BLOCK).map(|block| bounds_of(block, scales)).collect();
-        Self { order: places.par_iter().map(|place| place.id).collect(), bounds }
+        let bounds: Vec<_> =
+            places.par_chunks(BLOCK).map(|block| bounds_of(block, scales)).collect();
+        let mut order: Vec<u32> = places.par_iter().map(|place| place.id).collect();
+        order.resize(bounds.len() * BLOCK, NONE);
+        Self { order, own: bounds.len(), bounds, merged: None }
+    }
+
+    /// The same with merged Gaussians, layer upon layer: those of a block and its neighbours are
+    /// the next block, until there is one.
+    ///
+    /// # Errors
+    /// `internal` where merged Gaussians are not Gaussians any more.
+    pub fn detailed(gaussians: &Gaussians) -> Result<Self> {
+        let mut blocks = Self::of(gaussians);
+        let mut merger = Merger::new(gaussians);
+        let mut below = 0;
+        while blocks.bounds.len() - below > 1 {
+            let first = blocks.bounds.len();
+            let of_block = |at: usize| merger.merge(blocks.ids(at));
+            let parts: Vec<Part> = (below..first).into_par_iter().map(of_block).collect();
+            // The blocks whose merged Gaussians fill one.
+            let mut children = below;
+            while children < first {
+                let (mut held, mut next) = (0, children);
+                while next < first && held + parts[next - below].len() <= BLOCK {
+                    held += parts[next - below].len();
+                    next += 1;
+                }
+                let parts = &parts[children - below..next - below];
+                blocks.add(children..next, parts, merger.next_id());
+                parts.iter().for_each(|part| merger.take(part));
+                children = next;
+            }
+            below = first;
+        }
+        blocks.merged = Some(Arc::new(merger.finish()?));
+        Ok(blocks)
+    }
+
+    /// Adds the block that stands for `children`, whose merged Gaussians are `parts` and count from
+    /// `first_id` on.
+    fn add(&mut self, children: Range<usize>, parts: &[Part], first_id: u32) {
+        let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+        let parent = self.bounds.len() as u32;
+        for child in &mut self.bounds[children] {
+            child.parent = parent;
+            let [center, half] = [child.center, child.half].map(|v| DVec3::from(v.map(f64::from)));
+            (low, high) = (low.min(center - half), high.max(center + half));
+        }
+        let reach = parts.iter().map(Part::reach).fold(0.0, f32::max);
+        let error = parts.iter().map(Part::error).fold(0.0, f32::max);
+        self.bounds.push(Bounds { reach, error, ..bounds_around(low, high) });
+        let count = parts.iter().map(Part::len).sum::<usize>() as u32;
+        self.order.extend(first_id..first_id + count);
+        self.order.resize(self.bounds.len() * BLOCK, NONE);
     }
 
     /// The Gaussians of block `at`, ascending.
     pub fn ids(&self, at: usize) -> &[u32] {
-        &self.order[at * BLOCK..self.order.len().min((at + 1) * BLOCK)]
+        let ids = &self.order[at * BLOCK..(at + 1) * BLOCK];
+        &ids[..ids.partition_point(|&id| id != NONE)]
     }
-}
 
-/// Least and largest coordinates.
-fn corners(places: &[Place]) -> [[f32; 3]; 2] {
-    let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
-    for place in places {
-        let at = Vec3::from(place.at);
-        (low, high) = (low.min(at), high.max(at));
-    }
-    [low.to_array(), high.to_array()]
-}
-
-/// Orders places so that blocks of them are close together.
-fn split(places: &mut [Place]) {
-    if places.len() <= BLOCK {
-        return places.sort_unstable_by_key(|place| place.id);
-    }
-    let [low, high] = corners(places);
-    let side = |axis: &usize| high[*axis] - low[*axis];
-    let axis = (0..3).max_by(|a, b| side(a).total_cmp(&side(b))).unwrap_or(0);
-    // Both parts but the last end with a whole block.
-    let middle = places.len().div_ceil(BLOCK) / 2 * BLOCK;
-    places.select_nth_unstable_by(middle, |a, b| {
-        a.at[axis].total_cmp(&b.at[axis]).then(a.id.cmp(&b.id))
-    });
-    let large = places.len() > SPLIT_MIN;
-    let (near, far) = places.split_at_mut(middle);
-    if large {
-        rayon::join(|| split(near), || split(far));
-    } else {
-        split(near);
-        split(far);
+    /// Whether the view shows block `at`: it may touch the picture and is fine enough, and the
+    /// block that stands for it is not. Of each Gaussian one block of those that it is merged in is
+    /// shown, or none where that cannot touch the picture.
+    pub fn is_shown(&self, at: usize, frustum: &Frustum) -> bool {
+        let bounds = &self.bounds[at];
+        let parent = self.bounds.get(bounds.parent as usize);
+        frustum.is_fine(bounds)
+            && !parent.is_some_and(|parent| frustum.is_fine(parent))
+            && frustum.may_show(bounds)
     }
 }
 
 /// Bounds of the Gaussians of a block.
 fn bounds_of(places: &[Place], scales: &[[f32; 3]]) -> Bounds {
-    let [low, high] = corners(places);
-    let mut bounds = Bounds::default();
-    for axis in 0..3 {
-        let center = 0.5 * low[axis] + 0.5 * high[axis];
-        bounds.center[axis] = center;
-        // The middle is rounded: the box around it must hold both corners.
-        bounds.half[axis] = (high[axis] - center).max(center - low[axis]).next_up();
-    }
     let of = |place: &Place| scales[place.id as usize].into_iter().fold(0.0, f32::max);
-    bounds.reach = places.iter().map(of).fold(0.0, f32::max);
-    bounds
+    let reach = places.iter().map(of).fold(0.0, f32::max);
+    let [low, high] = corners(places).map(|corner| DVec3::from(corner.map(f64::from)));
+    Bounds { reach, ..bounds_around(low, high) }
+}
+
+/// A box that holds both corners. Its middle is rounded, and so is what is between.
+fn bounds_around(low: DVec3, high: DVec3) -> Bounds {
+    let center = (0.5 * (low + high)).as_vec3();
+    let middle = center.as_dvec3();
+    let half = (high - middle).max(middle - low).as_vec3().to_array().map(f32::next_up);
+    Bounds { center: center.to_array(), half, ..Bounds::default() }
 }
 
 /// What a view shows of space: the planes beyond which no Gaussian touches the picture.
@@ -149,6 +204,8 @@ pub struct Frustum {
     pub(crate) photos: (DVec3, f64),
     /// What a magnified view adds to a scale at most, for each unit of the distance from a photo.
     pub(crate) widens: f64,
+    /// How far a Gaussian may be from the one that stands for it, for each unit of depth.
+    pub(crate) detail: f64,
 }
 
 impl Frustum {
@@ -174,7 +231,21 @@ impl Frustum {
             near: view.near,
             photos,
             widens,
+            detail: f64::from(request.detail) / view.pixels_per_step(),
         }
+    }
+
+    /// Whether the Gaussians of a block may be drawn in place of those that they stand for: they
+    /// are the scene's own, or no nearer than the near plane and so far away that what they differ
+    /// by is under [`RenderRequest::detail`] pixels everywhere. A parent never is fine where its
+    /// child is not: it holds the child's box, and its error is larger.
+    pub fn is_fine(&self, bounds: &Bounds) -> bool {
+        let [center, half] = [bounds.center, bounds.half].map(|v| DVec3::from(v.map(f64::from)));
+        let from = center - self.center;
+        let rounding = ROUNDING * (from.abs() + half);
+        let nearest = self.axis.dot(from) - self.axis.abs().dot(half + rounding);
+        let error = f64::from(bounds.error);
+        error < 0.0 || (nearest >= self.near && error < self.detail * nearest)
     }
 
     /// Whether the view may show a Gaussian within `bounds`. False only if no such Gaussian touches
@@ -226,6 +297,8 @@ pub(crate) struct BlockCache {
 struct CachedBlocks {
     /// [`Gaussians::shape_identity`].
     shape: u64,
+    /// Whether they are to have merged Gaussians.
+    detailed: bool,
     life: Weak<()>,
     /// `None` while they are made.
     blocks: Option<Arc<Blocks>>,
@@ -237,28 +310,44 @@ impl BlockCache {
         Self { from, scenes: Mutex::default() }
     }
 
-    /// The blocks of a scene, made now if it is new. `None` where it has none, or while another
-    /// thread makes them: a frame without them has the same pixels.
-    pub(crate) fn get(&self, gaussians: &Gaussians) -> Option<Arc<Blocks>> {
+    /// The blocks of a scene, made now if it is new; if `detailed`, with merged Gaussians. `None`
+    /// where it has none, or while another thread makes them: a frame without them has the same
+    /// pixels, or differs less than is permitted.
+    ///
+    /// # Errors
+    /// As [`Blocks::detailed`].
+    pub(crate) fn get(&self, gaussians: &Gaussians, detailed: bool) -> Result<Option<Arc<Blocks>>> {
         if gaussians.len() < self.from.max(1) {
-            return None;
+            return Ok(None);
         }
         let shape = gaussians.shape_identity();
+        let is_it = |one: &CachedBlocks| one.shape == shape && one.detailed == detailed;
         {
             let mut scenes = self.scenes.lock();
             scenes.retain(|one| one.shape == shape || one.life.strong_count() > 0);
-            if let Some(found) = scenes.iter_mut().find(|one| one.shape == shape) {
+            if let Some(found) = scenes.iter_mut().find(|one| is_it(one)) {
                 // The same shape may live on with other entries.
                 found.life = gaussians.life();
-                return found.blocks.clone();
+                return Ok(found.blocks.clone());
             }
-            scenes.push(CachedBlocks { shape, life: gaussians.life(), blocks: None });
+            let life = gaussians.life();
+            scenes.push(CachedBlocks { shape, detailed, life, blocks: None });
         }
-        let blocks = Arc::new(Blocks::of(gaussians));
+        let made = match detailed {
+            true => Blocks::detailed(gaussians),
+            false => Ok(Blocks::of(gaussians)),
+        };
         let mut scenes = self.scenes.lock();
-        if let Some(found) = scenes.iter_mut().find(|one| one.shape == shape) {
+        let blocks = match made {
+            Ok(blocks) => Arc::new(blocks),
+            Err(error) => {
+                scenes.retain(|one| !is_it(one));
+                return Err(error);
+            }
+        };
+        if let Some(found) = scenes.iter_mut().find(|one| is_it(one)) {
             found.blocks = Some(Arc::clone(&blocks));
         }
-        Some(blocks)
+        Ok(Some(blocks))
     }
 }

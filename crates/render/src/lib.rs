@@ -20,8 +20,10 @@ pub mod cpu;
 pub mod gpu;
 pub mod labels;
 pub mod levels;
+pub mod merged;
 pub mod options;
 pub mod oracle;
+mod places;
 pub mod plan;
 pub mod renderer;
 pub mod select;
@@ -150,6 +152,10 @@ pub struct RenderRequest {
     /// Largest difference to the exact picture that is accepted, levels of 255: 0 to
     /// [`budget::ERROR_MAX`]; 0 is exact. docs/conventions.md says what it means for each picture.
     pub error: f32,
+    /// Permission to draw merged Gaussians in place of those that are far away, pixels: how far
+    /// one may be from the one that stands for it, 0 to [`merged::DETAIL_MAX`]. At 0 none are
+    /// drawn. `error` says nothing of what they change.
+    pub detail: f32,
 }
 
 impl RenderRequest {
@@ -167,6 +173,7 @@ impl RenderRequest {
             antialiased: false,
             near,
             error: 0.0,
+            detail: 0.0,
         }
     }
 

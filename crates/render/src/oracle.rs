@@ -17,6 +17,7 @@ use super::{
         SH_C3, SH_OFFSET, TRANSMITTANCE_MIN,
     },
     labels::BLEND_WIDTH,
+    merged::Merged,
 };
 use crate::{
     error::Result,
@@ -107,9 +108,36 @@ pub fn render_pixels(
     pixels: &[[u32; 2]],
 ) -> Result<Vec<OraclePixel>> {
     let lens = request.camera.intrinsics.validated("camera")?;
+    let splats = (0..gaussians.len()).filter_map(|i| splat(gaussians, i, request, &lens));
+    Ok(blend(splats.collect(), request, pixels))
+}
+
+/// As [`render_pixels`], of these Gaussians alone: merged ones count on after the scene's own.
+///
+/// # Errors
+/// As [`render_pixels`].
+pub fn render_merged(
+    gaussians: &Gaussians,
+    merged: &Merged,
+    ids: &[usize],
+    request: &RenderRequest,
+    pixels: &[[u32; 2]],
+) -> Result<Vec<OraclePixel>> {
+    let lens = request.camera.intrinsics.validated("camera")?;
+    let entries = merged.entries(gaussians);
+    let of = |&id: &usize| match id.checked_sub(gaussians.len()) {
+        None => splat(gaussians, id, request, &lens),
+        Some(id) => {
+            let sum = f64::from(merged.sums[id]);
+            let splat = splat_of(&merged.gaussians, id, sum, request, &lens)?;
+            Some(Splat { entry: entries[id], ..splat })
+        }
+    };
+    Ok(blend(ids.iter().filter_map(of).collect(), request, pixels))
+}
+
+fn blend(mut splats: Vec<Splat>, request: &RenderRequest, pixels: &[[u32; 2]]) -> Vec<OraclePixel> {
     let corner = request.crop.map_or([0, 0], |crop| [crop.x, crop.y]);
-    let mut splats: Vec<Splat> =
-        (0..gaussians.len()).filter_map(|i| splat(gaussians, i, request, &lens)).collect();
     splats.sort_by(Splat::order);
     // Pixels of one row share the list of Gaussians that can reach the row.
     let mut by_row: Vec<usize> = (0..pixels.len()).collect();
@@ -133,7 +161,7 @@ pub fn render_pixels(
     for (i, pixel) in done.into_iter().flatten() {
         out[i] = pixel;
     }
-    Ok(out)
+    out
 }
 
 /// What one Gaussian adds to a pixel.
@@ -228,6 +256,17 @@ pub fn splat(
     request: &RenderRequest,
     lens: &Intrinsics,
 ) -> Option<Splat> {
+    splat_of(gaussians, i, 0.0, request, lens)
+}
+
+/// The same of one that stands for Gaussians whose opacities have this sum; 0: for none.
+fn splat_of(
+    gaussians: &Gaussians,
+    i: usize,
+    sum: f64,
+    request: &RenderRequest,
+    lens: &Intrinsics,
+) -> Option<Splat> {
     let pose = request.camera.camera_to_world;
     let mean = DVec3::from(gaussians.means()[i].map(f64::from));
     let from_eye = mean - (pose.center() - gaussians.origin());
@@ -269,11 +308,20 @@ pub fn splat(
         return None;
     }
     let mut opacity = f64::from(gaussians.opacities()[i]);
+    if sum > 0.0 && !request.antialiased {
+        // Members with its shape, smaller by one share: `crate::merged`.
+        let share = opacity / sum;
+        let member = share * share * sharp_det + share * learnt * (xx + yy) + learnt * learnt;
+        opacity = sum * (member / blurred(learnt)).sqrt();
+    }
     if request.antialiased {
         opacity *= (sharp_det / det).max(0.0).sqrt();
     } else {
         let least = f64::from(ALPHA_MIN);
         opacity -= (1.0 - (blurred(learnt) / det).sqrt()) * (opacity - least);
+    }
+    if sum > 0.0 {
+        opacity = opacity.min(opacity.sqrt());
     }
     if opacity < f64::from(ALPHA_MIN) {
         return None;

@@ -7,6 +7,7 @@ use super::{
     Background, RenderRequest,
     budget::check_error,
     constants::{FRUSTUM_MARGIN, TILE_SIZE},
+    merged::check_detail,
 };
 use crate::error::{Error, Result};
 
@@ -45,7 +46,7 @@ impl View {
     ///
     /// # Errors
     /// `invalid_request` when the intrinsics are unusable, the near plane is not a finite number
-    /// over 0, the error is out of range, or background, sources or labels are not finite;
+    /// over 0, the error or the detail is out of range, or background, sources or labels are not finite;
     /// `limit_exceeded` for a picture beyond memory.
     pub fn new(origin: DVec3, request: &RenderRequest) -> Result<Self> {
         let lens = request.camera.intrinsics.validated("camera")?;
@@ -68,6 +69,7 @@ impl View {
             source.check(i)?;
         }
         check_error(request.error)?;
+        check_detail(request.detail)?;
         request.labels.check()?;
         let pixels = u64::from(cropped.width) * u64::from(cropped.height);
         if pixels > PIXELS_MAX || cropped.width.max(cropped.height) > SIDE_MAX {
@@ -113,6 +115,14 @@ impl View {
         let across = to_world * DVec3::X / self.focal[0];
         let down = to_world * DVec3::Y / self.focal[1];
         [first, across, down].map(|v| (v * scale).as_vec3().to_array())
+    }
+
+    /// Pixels by which a point of the picture moves at most where it moves by 1 in the world at a
+    /// depth of 1.
+    pub(crate) fn pixels_per_step(&self) -> f64 {
+        let steepest = |axis: usize| self.slope_min[axis].abs().max(self.slope_max[axis].abs());
+        let slope = steepest(0).hypot(steepest(1));
+        self.focal[0].max(self.focal[1]) * slope.hypot(1.0)
     }
 
     /// Tiles in a row of tiles.

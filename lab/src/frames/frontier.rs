@@ -106,7 +106,7 @@ pub(crate) fn run(args: &FrontierArgs, rows: &mut Rows) -> Result<()> {
 
 /// The time of each request, milliseconds: the least of rounds in which each is drawn in turn. A
 /// busy machine changes it least.
-fn times(
+pub(super) fn times(
     renderer: &dyn Renderer,
     gaussians: &Gaussians,
     requests: &[RenderRequest],

@@ -6,6 +6,7 @@
 
 pub(crate) mod aims;
 pub(crate) mod backward;
+pub(crate) mod detail;
 pub(crate) mod frontier;
 mod generated;
 pub(crate) mod skips;

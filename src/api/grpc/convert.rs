@@ -210,14 +210,16 @@ fn vec3(v: &pb::Vec3) -> [f64; 3] {
 
 /// How a view is rendered.
 pub(super) fn options(options: &pb::ViewOptions) -> Result<ViewOptions> {
-    let &pb::ViewOptions { width, height, antialiased, near, front_photos, magnify, .. } = options;
+    let &pb::ViewOptions {
+        width, height, antialiased, near, front_photos, magnify, detail, ..
+    } = options;
     let error = match options.error {
         Some(levels) => MaxError(levels),
         None => value("quality", options.quality)?,
     };
     let preset = given("preset", options.preset)?;
     let of_view = ViewOptions { width, height, antialiased, near, error, ..Default::default() };
-    Ok(ViewOptions { preset, front_photos, magnify, ..of_view })
+    Ok(ViewOptions { preset, front_photos, magnify, detail, ..of_view })
 }
 
 /// The same for a call that returns no picture.
@@ -322,7 +324,7 @@ pub(super) fn picture(options: &pb::ViewOptions) -> Result<PictureOptions> {
 
 /// One encoded picture.
 pub(super) fn view(view: RenderedView) -> pb::View {
-    message!(View from view { width, height, depth_scale, error, etag }
+    message!(View from view { width, height, depth_scale, error, detail, etag }
         render_ms: view.times.render_ms,
         camera_index: u32::try_from(view.camera_index).unwrap_or(u32::MAX),
         kind: pb::Kind::from(view.kind).into(),

@@ -20,13 +20,14 @@ const ALLOWED: [HeaderName; 6] = [
     header::IF_NONE_MATCH,
 ];
 /// Headers that a page may read.
-const EXPOSED: [HeaderName; 11] = [
+const EXPOSED: [HeaderName; 12] = [
     HeaderName::from_static("x-request-id"),
     HeaderName::from_static("x-depth-scale"),
     HeaderName::from_static("x-camera-to-world"),
     HeaderName::from_static("x-intrinsics"),
     HeaderName::from_static("x-shape"),
     HeaderName::from_static("x-error"),
+    HeaderName::from_static("x-detail"),
     HeaderName::from_static("server-timing"),
     HeaderName::from_static("idempotency-replayed"),
     header::ETAG,

@@ -83,7 +83,8 @@ pub(super) struct FeaturesParams {
             status = 200, content_type = "image/png", body = Vec<u8>,
             description = "The picture. x-depth-scale: world units a step of a depth PNG. \
                 x-shape: height, width and samples of a pixel of rgb8, rgba8 and grey8. \
-                x-error: bound of its difference to the exact picture, levels of 255"
+                x-error: bound of its difference to the exact picture, levels of 255. \
+                x-detail: how far Gaussians are at most from merged ones, pixels"
         ),
         (status = 304, description = "If-None-Match names this picture"),
     )
@@ -215,6 +216,7 @@ pub(super) fn view_headers(view: &RenderedView) -> HeaderMap {
         ("x-camera-to-world", pose),
         ("x-intrinsics", format!("{},{},{},{}", k.fx, k.fy, k.cx, k.cy)),
         ("x-error", view.error.to_string()),
+        ("x-detail", view.detail.to_string()),
     ];
     let scale = view.depth_scale.map(|scale| ("x-depth-scale", scale.to_string()));
     let shape = view.shape().map(|shape| shape.iter().map(u32::to_string).collect::<Vec<_>>());

@@ -193,6 +193,7 @@ fn index_row(name: &str, view: &RenderedView) -> serde_json::Value {
         "camera": view.camera,
         "depth_scale": view.depth_scale,
         "error": view.error,
+        "detail": view.detail,
         "shape": view.shape(),
     })
 }

@@ -189,6 +189,7 @@ impl Ask {
             }
             .into(),
             error: self.number("error"),
+            detail: self.number("detail").unwrap_or_default(),
         }
     }
 
@@ -318,16 +319,19 @@ impl Door {
         Ok(self.bounded(id, ask).await?.0)
     }
 
-    /// The same, and the bound of its error.
-    pub(crate) async fn bounded(&self, id: &str, ask: &Ask) -> Result<(Vec<u8>, f32), Fault> {
+    /// The same, and the bounds that the answer tells.
+    pub(crate) async fn bounded(&self, id: &str, ask: &Ask) -> Result<(Vec<u8>, Told), Fault> {
         match self {
             Self::Http { base, client } => {
                 let url = url(base, &format!("/v1/scenes/{id}/view"), &ask.pairs);
                 let answer = client.get(url).send().await.expect("an answer");
-                let told = answer.headers().get("x-error").cloned();
+                let headers = answer.headers().clone();
+                let told = |name: &str| {
+                    let told = headers.get(name).expect(name).to_str().expect("a text").parse();
+                    told.expect("a number")
+                };
                 let file = bytes(answer).await?;
-                let told = told.expect("x-error").to_str().expect("a text").parse();
-                Ok((file, told.expect("a number")))
+                Ok((file, Told { error: told("x-error"), detail: told("x-detail") }))
             }
             Self::Grpc { client } => {
                 let request = pb::RenderViewRequest {
@@ -340,7 +344,8 @@ impl Door {
                 };
                 let view = client.clone().render_view(request).await.map_err(fault_of)?;
                 let view = view.into_inner();
-                Ok((view.data.to_vec(), view.error))
+                let bounds = Told { error: view.error, detail: view.detail };
+                Ok((view.data.to_vec(), bounds))
             }
         }
     }
@@ -391,6 +396,13 @@ impl Door {
             }
         }
     }
+}
+
+/// How far a view may be from the exact one, as its answer tells.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Told {
+    pub(crate) error: f32,
+    pub(crate) detail: f32,
 }
 
 /// All pieces of a file, and the size that was said.

@@ -153,6 +153,10 @@ class Drawing(TypedDict, total=False):
     #: Largest difference to the exact picture that is accepted for less time, levels of 255: 0 to
     #: 32, "exact" (0) or "fast" (2). Views with depth are exact.
     error: float | Literal["exact", "fast"]
+    #: Permission to draw one merged Gaussian for many that are far away, pixels: how far one may be
+    #: from the one that stands for it, 0 (none is merged) to 16. `error` does not count what they
+    #: change.
+    detail: float
     #: "paper" draws and scores as the paper does; that of the scene by default.
     preset: Preset
     #: Photos whose Gaussians are in front, the nearest ones; 0: those of all. That of the preset by

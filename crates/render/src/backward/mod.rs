@@ -99,7 +99,7 @@ impl<T: Copy + Default> Gradients<T> {
 pub(crate) fn backward_request(request: &RenderRequest) -> RenderRequest {
     let kinds = Kinds { depth: request.kinds.depth, ..Kinds { depth: false, ..Kinds::ALL } };
     let (labels, samples) = (Labels::None, Samples::F32);
-    RenderRequest { kinds, labels, samples, error: 0.0, ..request.clone() }
+    RenderRequest { kinds, labels, samples, error: 0.0, detail: 0.0, ..request.clone() }
 }
 
 /// Derivatives of the 16 basis functions up to degree 3 by the unit direction (x, y, z).

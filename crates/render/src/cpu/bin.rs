@@ -89,7 +89,8 @@ impl<'a> DepthKeys<'a> {
     fn pair(&self, depth: f32, id: usize, shown: &Shown) -> u64 {
         let mut key = depth.to_bits();
         if !self.sources.is_empty() {
-            let view = usize::from(self.gaussians.source()[shown.id(id)].view);
+            let (gaussians, own) = shown.find(self.gaussians, id);
+            let view = usize::from(gaussians.source()[own].view);
             if self.sources.get(view).is_some_and(|source| source.behind) {
                 key |= BEHIND_BIT;
             }

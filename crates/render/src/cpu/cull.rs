@@ -1,17 +1,24 @@
 //! Stage 0: which Gaussians are projected. Shader: `shaders/cull.wgsl`
 //!
-//! In: the blocks of the scene. Out: the Gaussians of the blocks that the view may show, in the
-//! order of the scene. Every later stage counts in this list, so its numbers have the same order as
-//! those of the scene: ties at equal depth stay.
+//! In: the blocks of the scene. Out: the Gaussians of the blocks that the view shows, in the order
+//! of the scene; merged ones come after its own. Every later stage counts in this list, so its
+//! numbers have the same order as those of the scene: ties at equal depth stay.
 
 use std::{
     borrow::Cow,
-    sync::atomic::{AtomicU64, Ordering},
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
 };
 
 use rayon::prelude::*;
 
-use crate::blocks::{Blocks, Frustum};
+use crate::{
+    blocks::{Blocks, Frustum},
+    merged::Merged,
+    scene::Gaussians,
+};
 
 /// Words of the set of Gaussians that a thread reads at a time.
 const WORDS: usize = 1 << 10;
@@ -19,24 +26,29 @@ const WORDS: usize = 1 << 10;
 /// The Gaussians of a view, in the order of the scene.
 #[derive(Debug, Default)]
 pub enum Shown {
-    /// All of them.
+    /// All of the scene's own.
     #[default]
     All,
-    /// These.
-    Some(Vec<u32>),
+    /// These; merged ones count on after the scene's own.
+    Some {
+        /// Ascending.
+        ids: Vec<u32>,
+        /// The merged ones of the scene, where it has some.
+        merged: Option<Arc<Merged>>,
+    },
 }
 
 impl Shown {
-    /// Those of the blocks that `frustum` may show.
+    /// Those of the blocks that `frustum` shows.
     pub fn of(blocks: &Blocks, frustum: &Frustum) -> Self {
-        let bounds = blocks.bounds.par_iter().with_min_len(1 << 9).enumerate();
-        let seen = bounds.filter(|(_, bounds)| frustum.may_show(bounds)).map(|(at, _)| at);
-        let seen: Vec<usize> = seen.collect();
-        if seen.len() == blocks.bounds.len() {
+        let all = (0..blocks.bounds.len()).into_par_iter().with_min_len(1 << 9);
+        let seen: Vec<usize> = all.filter(|&at| blocks.is_shown(at, frustum)).collect();
+        if seen.len() == blocks.own && seen.last().is_none_or(|&at| at < blocks.own) {
             return Self::All;
         }
+        let merged = blocks.merged.clone();
         if seen.is_empty() {
-            return Self::Some(Vec::new());
+            return Self::Some { ids: Vec::new(), merged };
         }
         // A bit for each Gaussian.
         let bits: Vec<AtomicU64> = (0..blocks.order.len().div_ceil(64))
@@ -63,33 +75,59 @@ impl Shown {
             ids
         });
         let parts: Vec<Vec<u32>> = ids.collect();
-        Self::Some(parts.concat())
+        Self::Some { ids: parts.concat(), merged }
     }
 
     /// Number of them, in a scene of `count`.
     pub(super) fn len(&self, count: usize) -> usize {
         match self {
             Self::All => count,
-            Self::Some(ids) => ids.len(),
+            Self::Some { ids, .. } => ids.len(),
         }
     }
 
-    /// The Gaussian at place `at`.
+    /// The number of the one at place `at`.
     #[inline(always)]
     pub(super) fn id(&self, at: usize) -> usize {
         match self {
             Self::All => at,
-            Self::Some(ids) => ids[at] as usize,
+            Self::Some { ids, .. } => ids[at] as usize,
         }
     }
 
-    /// The numbers of these out of those of all.
-    pub(super) fn only<'a, T: Copy + Send + Sync>(&self, all: &'a [T]) -> Cow<'a, [T]> {
+    /// The merged ones, where one may be among these.
+    #[inline(always)]
+    pub(super) fn merged(&self) -> Option<&Merged> {
         match self {
-            Self::All => Cow::Borrowed(all),
-            Self::Some(ids) => {
-                ids.par_iter().map(|&id| all[id as usize]).collect::<Vec<_>>().into()
-            }
+            Self::All => None,
+            Self::Some { merged, .. } => merged.as_deref(),
         }
+    }
+
+    /// The one at place `at`: the Gaussians of the scene or the merged ones, and its number there.
+    #[inline(always)]
+    pub(super) fn find<'a>(
+        &'a self,
+        gaussians: &'a Gaussians,
+        at: usize,
+    ) -> (&'a Gaussians, usize) {
+        let id = self.id(at);
+        match (self.merged(), id.checked_sub(gaussians.len())) {
+            (Some(merged), Some(id)) => (&merged.gaussians, id),
+            _ => (gaussians, id),
+        }
+    }
+
+    /// Their entries of the bank.
+    pub(super) fn entries<'a>(&self, gaussians: &'a Gaussians) -> Cow<'a, [u16]> {
+        let own = gaussians.semantic_index();
+        let Self::Some { ids, merged } = self else { return Cow::Borrowed(own) };
+        let merged = merged.as_ref().map(|merged| merged.entries(gaussians));
+        let merged = merged.as_deref().unwrap_or_default();
+        let entry = |&id: &u32| {
+            let id = id as usize;
+            own.get(id).copied().unwrap_or_else(|| merged[id - own.len()])
+        };
+        ids.par_iter().map(entry).collect::<Vec<_>>().into()
     }
 }

@@ -124,7 +124,7 @@ impl CpuRenderer {
         gaussians: &Gaussians,
         request: &RenderRequest,
     ) -> Result<(Frame, Vec<DispatchTime>)> {
-        let blocks = self.blocks.get(gaussians);
+        let blocks = self.blocks.get(gaussians, request.detail > 0.0)?;
         let mut scratch = self.frames.take();
         let timed = self.draw_into(gaussians, blocks.as_deref(), request, &mut scratch)?;
         if scratch.projected.footprints.len() <= KEPT_GAUSSIANS_MAX {
@@ -164,7 +164,7 @@ impl CpuRenderer {
         frame.stats.visible = seen.filter(|&&tiles| tiles > 0).count() as u64;
         let entries = match request.labels {
             Labels::None => Cow::default(),
-            _ => scratch.projected.shown.only(gaussians.semantic_index()),
+            _ => scratch.projected.shown.entries(gaussians),
         };
         let mut band = Band {
             keys: DepthKeys::new(gaussians, &request.sources),
@@ -308,7 +308,7 @@ impl Renderer for CpuRenderer {
     }
 
     fn prepare(&self, gaussians: &Gaussians) -> Result<()> {
-        self.threads.install(|| self.blocks.get(gaussians));
+        self.threads.install(|| self.blocks.get(gaussians, false))?;
         Ok(())
     }
 

@@ -15,6 +15,7 @@ use super::{
 use crate::{
     RenderRequest, Source,
     constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK, OWN_SIZE, PIXEL_PX2},
+    merged::Merged,
     scene::Gaussians,
     view::View,
 };
@@ -77,6 +78,7 @@ impl LaneKernel for Chunk<'_> {
     fn run<S: Lanes>(self, simd: S) {
         let Self { request, view, options, out: (footprints, spans, tiles), .. } = self;
         let magnifies = !request.sources.is_empty();
+        let merged = self.shown.merged();
         let grid = Grid::whole(view, options);
         let out = footprints.chunks_mut(BLOCK).zip(spans.chunks_mut(BLOCK));
         let out = out.zip(tiles.chunks_mut(BLOCK)).enumerate();
@@ -86,11 +88,16 @@ impl LaneKernel for Chunk<'_> {
             let first = self.first + at * BLOCK;
             let ids = &mut [0; BLOCK][..footprints.len()];
             (first..).zip(&mut *ids).for_each(|(at, id)| *id = self.shown.id(at));
-            block.load(self.gaussians, ids);
+            block.load(self.gaussians, ids, merged);
             if magnifies {
-                block.load_widths(self.gaussians, ids, &request.sources);
+                block.load_widths(self.gaussians, ids, merged, &request.sources);
             }
-            if !block.project(simd, view, request.antialiased, magnifies) {
+            let options = BlockOptions {
+                antialiased: request.antialiased,
+                magnifies,
+                merged: merged.is_some(),
+            };
+            if !block.project(simd, view, options) {
                 continue;
             }
             let mut seen = 0_u32;
@@ -111,6 +118,16 @@ impl LaneKernel for Chunk<'_> {
     }
 }
 
+/// What the projection of a block computes.
+#[derive(Clone, Copy)]
+struct BlockOptions {
+    antialiased: bool,
+    /// Whether widths are loaded.
+    magnifies: bool,
+    /// Whether some may be merged.
+    merged: bool,
+}
+
 /// A block of Gaussians and their footprints, one row for each number.
 #[derive(Default)]
 struct Block {
@@ -120,6 +137,8 @@ struct Block {
     /// Width of the source pixel in the world; 0 where it is not known.
     width: Row,
     opacity: Row,
+    /// Opacities that it stands for, in sum; 0 of a Gaussian of the scene.
+    sum: Row,
     center: [Row; 2],
     conic_shear: Row,
     conic_x: Row,
@@ -131,26 +150,49 @@ struct Block {
 
 impl Block {
     #[inline(always)]
-    fn load(&mut self, gaussians: &Gaussians, ids: &[usize]) {
+    fn load(&mut self, gaussians: &Gaussians, ids: &[usize], merged: Option<&Merged>) {
         for (k, &id) in ids.iter().enumerate() {
-            for (row, value) in self.mean.iter_mut().zip(gaussians.means()[id]) {
-                row[k] = f64::from(value);
+            match merged.and_then(|merged| Some((merged, id.checked_sub(gaussians.len())?))) {
+                None => {
+                    self.set(k, gaussians, id);
+                    self.sum[k] = 0.0;
+                }
+                Some((merged, id)) => {
+                    self.set(k, &merged.gaussians, id);
+                    self.sum[k] = f64::from(merged.sums[id]);
+                }
             }
-            for (row, value) in self.scale.iter_mut().zip(gaussians.scales()[id]) {
-                row[k] = f64::from(value);
-            }
-            for (row, value) in self.quat.iter_mut().zip(gaussians.quats()[id]) {
-                row[k] = f64::from(value);
-            }
-            self.opacity[k] = f64::from(gaussians.opacities()[id]);
         }
     }
 
     #[inline(always)]
-    fn load_widths(&mut self, gaussians: &Gaussians, ids: &[usize], sources: &[Source]) {
+    fn set(&mut self, k: usize, gaussians: &Gaussians, id: usize) {
+        for (row, value) in self.mean.iter_mut().zip(gaussians.means()[id]) {
+            row[k] = f64::from(value);
+        }
+        for (row, value) in self.scale.iter_mut().zip(gaussians.scales()[id]) {
+            row[k] = f64::from(value);
+        }
+        for (row, value) in self.quat.iter_mut().zip(gaussians.quats()[id]) {
+            row[k] = f64::from(value);
+        }
+        self.opacity[k] = f64::from(gaussians.opacities()[id]);
+    }
+
+    #[inline(always)]
+    fn load_widths(
+        &mut self,
+        gaussians: &Gaussians,
+        ids: &[usize],
+        merged: Option<&Merged>,
+        sources: &[Source],
+    ) {
         for (k, &id) in ids.iter().enumerate() {
             self.width[k] = 0.0;
-            if let Some(source) = sources.get(usize::from(gaussians.source()[id].view)) {
+            let of_merged = || Some(merged?.gaussians.source()[id - gaussians.len()]);
+            let source = gaussians.source().get(id).copied().or_else(of_merged);
+            let source = source.and_then(|source| sources.get(usize::from(source.view)));
+            if let Some(source) = source {
                 let mut depth = 0.0;
                 for (axis, mean) in self.mean.iter().enumerate() {
                     let from = mean[k] - f64::from(source.center[axis]);
@@ -161,16 +203,10 @@ impl Block {
         }
     }
 
-    /// EWA projection of the block; `magnifies` if its widths are loaded. Returns whether any
-    /// Gaussian may be visible.
+    /// EWA projection of the block. Returns whether any Gaussian may be visible.
     #[inline(always)]
-    fn project<S: Lanes>(
-        &mut self,
-        simd: S,
-        view: &View,
-        antialiased: bool,
-        magnifies: bool,
-    ) -> bool {
+    fn project<S: Lanes>(&mut self, simd: S, view: &View, options: BlockOptions) -> bool {
+        let BlockOptions { antialiased, magnifies, merged } = options;
         let mut any = false;
         self.kept = [0.0; BLOCK];
         // No `map` of arrays from here on: what it calls is not compiled for the processor.
@@ -246,6 +282,17 @@ impl Block {
             let det = det_sharp + drawn * (xx + yy) + drawn * drawn;
             let var_y = yy + drawn;
             let half = number(0.5);
+            let stands = at(&self.sum).at_least(number(f64::MIN_POSITIVE));
+            if merged && !antialiased {
+                // What its members cover with the blur that they were learnt with (`merged`).
+                let det_learnt = det_sharp + learnt * (xx + yy) + learnt * learnt;
+                let opacity = at(&self.opacity);
+                let spread = at(&self.sum) * learnt;
+                let covers =
+                    opacity * opacity * det_sharp + opacity * spread * (xx + yy) + spread * spread;
+                let all = (covers / det_learnt).sqrt();
+                (opacity + (all - opacity).only(stands)).put(&mut self.opacity, i);
+            }
             if antialiased {
                 let share = (det_sharp / det).sqrt();
                 (at(&self.opacity) * share).put(&mut self.opacity, i);
@@ -256,6 +303,11 @@ impl Block {
                 let over = opacity - number(f64::from(ALPHA_MIN));
                 let gone = (number(1.0) - (det_learnt / det).sqrt()) * over;
                 (opacity - gone).put(&mut self.opacity, i);
+            }
+            if merged {
+                let opacity = at(&self.opacity);
+                let most = opacity.min(opacity.sqrt());
+                (opacity + (most - opacity).only(stands)).put(&mut self.opacity, i);
             }
             for (k, (center, slope)) in self.center.iter_mut().zip(slope).enumerate() {
                 let place = number(view.focal[k]) * slope + number(view.principal[k]);

@@ -34,7 +34,7 @@ pub fn shade(
         let mut brightest = 0.0_f32;
         for (k, (footprint, &tiles)) in footprints.iter_mut().zip(tiles).enumerate() {
             if tiles > 0 {
-                let i = shown.id(chunk * CHUNK + k);
+                let (gaussians, i) = shown.find(gaussians, chunk * CHUNK + k);
                 let sh = &gaussians.sh()[i * coefficients..(i + 1) * coefficients];
                 footprint.color = if flat {
                     sh[0].map(|value| (SH_OFFSET + SH_C0 * value).max(0.0))

@@ -169,7 +169,7 @@ impl Adapter {
         if self.holds(gaussians.shape_identity()) {
             return Ok(());
         }
-        let scene = DeviceScene::for_views(&on.gpu, gaussians, self.blocks_from())?;
+        let scene = DeviceScene::for_views(&on.gpu, gaussians, self.blocks_from(), false)?;
         let mut scenes = on.scenes.lock();
         scenes.put(&on.gpu, scene);
         *self.shapes.lock() = scenes.shapes();
@@ -279,7 +279,8 @@ impl Adapter {
         requests: &[&'a RenderRequest],
     ) -> Result<Vec<Option<Frame>>> {
         let labelled = requests.first().is_some_and(|one| one.labels != Labels::None);
-        let scene = context.scene(gaussians, labelled)?;
+        let detailed = requests.iter().any(|request| request.detail > 0.0);
+        let scene = context.scene(gaussians, labelled, detailed)?;
         let start = |request: &&'a RenderRequest| Drawing::new(gaussians.origin(), request, &scene);
         let mut drawings = requests.iter().map(start).collect::<Result<Vec<_>>>()?;
         let mut tools = context.tools(&scene, self.isects_max(), None);
@@ -298,7 +299,8 @@ impl Adapter {
         request: &RenderRequest,
         marks: Option<&mut Marks>,
     ) -> Result<Frame> {
-        let scene = context.scene(gaussians, request.labels != Labels::None)?;
+        let labelled = request.labels != Labels::None;
+        let scene = context.scene(gaussians, labelled, request.detail > 0.0)?;
         let mut tools = context.tools(&scene, self.isects_max(), marks);
         let mut drawing = Drawing::new(gaussians.origin(), request, &scene)?;
         let rows = drawing.whole();

@@ -2,6 +2,8 @@
 //! shaders/common/structs.wgsl, and the scenes on the device.
 #![allow(missing_docs, reason = "shaders/common/structs.wgsl describes the fields")]
 
+use std::sync::Arc;
+
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
@@ -15,6 +17,7 @@ use crate::{
     budget::{Budget, RayEnd, brightest},
     constants::{HALF_LEVEL, OWN_SIZE, TRANSMITTANCE_MIN},
     error::{Error, ErrorCode, Result},
+    merged::Merged,
     scene::Gaussians,
     view::View,
 };
@@ -74,7 +77,8 @@ pub struct ViewRow {
     pub photos: [f32; 4],
     pub photos_widen: f32,
     pub block_count: u32,
-    pub rest: [u32; 2],
+    pub detail: f32,
+    pub rest: u32,
 }
 
 /// `Source` of the shaders.
@@ -101,13 +105,15 @@ pub struct BlockRow {
     pub center: [f32; 3],
     pub reach: f32,
     pub half: [f32; 3],
-    pub rest: u32,
+    pub error: f32,
+    pub parent: u32,
+    pub rest: [u32; 3],
 }
 
 impl From<&Bounds> for BlockRow {
     fn from(bounds: &Bounds) -> Self {
-        let Bounds { center, half, reach } = *bounds;
-        Self { center, reach, half, rest: 0 }
+        let Bounds { center, half, reach, error, parent } = *bounds;
+        Self { center, reach, half, error, parent, rest: [0; 3] }
     }
 }
 
@@ -255,6 +261,7 @@ impl ViewRow {
             sides: frustum.sides.map(wide),
             photos: wide(frustum.photos),
             photos_widen: frustum.widens as f32,
+            detail: frustum.detail as f32,
             ..Self::new(view, background, request.antialiased)
         }
     }
@@ -264,7 +271,7 @@ impl ViewRow {
 #[derive(Clone, Debug)]
 pub(super) struct DeviceScene {
     shape: u64,
-    /// Number of Gaussians.
+    /// Number of Gaussians, with the merged ones.
     pub(super) count: u32,
     /// Spherical harmonics of each Gaussian.
     pub(super) sh_count: u32,
@@ -275,6 +282,8 @@ pub(super) struct DeviceScene {
     /// `[N, K, 3]` f32.
     pub(super) sh: wgpu::Buffer,
     pub(super) blocks: Option<DeviceBlocks>,
+    /// Uploaded when a request first permits them.
+    merged: Option<Arc<Merged>>,
     /// Uploaded when a request first asks for labels.
     pub(super) labels: Option<DeviceLabels>,
 }
@@ -285,18 +294,17 @@ pub(super) struct DeviceBlocks {
     count: u32,
     /// Of [`BlockRow`].
     pub(super) bounds: wgpu::Buffer,
-    /// `[N]` Gaussians, block after block.
+    /// Gaussians, block after block.
     pub(super) order: wgpu::Buffer,
 }
 
 impl DeviceBlocks {
-    fn upload(gpu: &Gpu, source: &Gaussians) -> Result<Self> {
-        let blocks = Blocks::of(source);
+    fn upload(gpu: &Gpu, blocks: &Blocks) -> Result<Self> {
         let rows: Vec<BlockRow> = blocks.bounds.iter().map(BlockRow::from).collect();
         Ok(Self {
             count: rows.len() as u32,
-            bounds: gpu.upload("blocks", bytemuck::cast_slice(&rows), None)?,
-            order: gpu.upload("order of blocks", bytemuck::cast_slice(&blocks.order), None)?,
+            bounds: gpu.upload("blocks", &[bytemuck::cast_slice(&rows)], None)?,
+            order: gpu.upload("order of blocks", &[bytemuck::cast_slice(&blocks.order)], None)?,
         })
     }
 }
@@ -312,15 +320,16 @@ pub(super) struct DeviceLabels {
 }
 
 impl DeviceLabels {
-    fn upload(gpu: &Gpu, source: &Gaussians) -> Result<Self> {
+    fn upload(gpu: &Gpu, source: &Gaussians, merged: Option<&Merged>) -> Result<Self> {
         let entries = source.semantic_index();
         let mut seen = vec![false; 1 << u16::BITS];
         entries.iter().for_each(|&entry| seen[usize::from(entry)] = true);
         let distinct = seen[1..].iter().filter(|seen| **seen).count() as u32;
         // Uploads are whole words.
         let mut padded = entries.to_vec();
-        padded.resize(entries.len().next_multiple_of(2), 0);
-        let entries = gpu.upload("bank entries", bytemuck::cast_slice(&padded), None)?;
+        padded.extend(merged.iter().flat_map(|merged| merged.entries(source).to_vec()));
+        padded.resize(padded.len().next_multiple_of(2), 0);
+        let entries = gpu.upload("bank entries", &[bytemuck::cast_slice(&padded)], None)?;
         Ok(Self { identity: source.identity(), entries, distinct })
     }
 }
@@ -342,47 +351,63 @@ impl DeviceScene {
         self.blocks.as_ref().map_or(0, |blocks| blocks.count)
     }
 
-    /// Uploads `source` for views, with blocks if it has `blocks_from` Gaussians or more.
+    /// Uploads `source` for views, with blocks if it has `blocks_from` Gaussians or more; with
+    /// merged ones too if it is to be `detailed`.
     /// Errors: as [`Self::upload`].
-    pub(super) fn for_views(gpu: &Gpu, source: &Gaussians, blocks_from: usize) -> Result<Self> {
-        let mut scene = Self::upload(gpu, source, None)?;
-        if source.len() >= blocks_from {
-            scene.blocks = Some(DeviceBlocks::upload(gpu, source)?);
+    pub(super) fn for_views(
+        gpu: &Gpu,
+        source: &Gaussians,
+        blocks_from: usize,
+        detailed: bool,
+    ) -> Result<Self> {
+        if source.len() < blocks_from {
+            return Self::upload(gpu, source, None);
         }
+        let blocks = if detailed { Blocks::detailed(source)? } else { Blocks::of(source) };
+        let merged = blocks.merged.as_deref();
+        let mut rows = rows_of(source);
+        rows.extend(merged.iter().flat_map(|merged| merged_rows(merged)));
+        let more = merged.map_or(&[][..], |merged| merged.gaussians.sh());
+        let mut scene = Self::of_rows(gpu, source, &rows, &[source.sh(), more], None)?;
+        scene.blocks = Some(DeviceBlocks::upload(gpu, &blocks)?);
+        scene.merged = blocks.merged;
         Ok(scene)
     }
 
     /// Uploads `source` without blocks, into the buffers of `old` where they have room.
     /// Errors: `limit_exceeded` when it does not fit the adapter's limits or memory.
     pub(super) fn upload(gpu: &Gpu, source: &Gaussians, old: Option<Self>) -> Result<Self> {
-        let (old_gaussians, old_sh) = old.map(|old| (old.gaussians, old.sh)).unzip();
-        let rows = rows_of(source);
-        Ok(Self {
-            shape: source.shape_identity(),
-            count: narrow("gaussians", source.len())?,
-            sh_count: source.sh_count() as u32,
-            brightest: brightest(source),
-            gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows), old_gaussians)?,
-            sh: gpu.upload("sh", bytemuck::cast_slice(source.sh()), old_sh)?,
-            blocks: None,
-            labels: None,
-        })
+        Self::of_rows(gpu, source, &rows_of(source), &[source.sh()], old)
     }
 
     /// Uploads `source` with so many places, those behind its Gaussians with opacity 0.
     /// Errors: as [`Self::upload`].
     pub(super) fn with_places(gpu: &Gpu, source: &Gaussians, places: usize) -> Result<Self> {
-        let (mut rows, mut sh) = (rows_of(source), source.sh().to_vec());
+        let mut rows = rows_of(source);
         rows.resize(places, GaussianRow::zeroed());
-        sh.resize(places * source.sh_count(), [0.0; 3]);
+        let more = vec![[0.0; 3]; (places - source.len()) * source.sh_count()];
+        Self::of_rows(gpu, source, &rows, &[source.sh(), &more], None)
+    }
+
+    /// Uploads these rows and harmonics, in parts, of `source`, without blocks.
+    fn of_rows(
+        gpu: &Gpu,
+        source: &Gaussians,
+        rows: &[GaussianRow],
+        sh: &[&[[f32; 3]]],
+        old: Option<Self>,
+    ) -> Result<Self> {
+        let (old_gaussians, old_sh) = old.map(|old| (old.gaussians, old.sh)).unzip();
+        let sh: Vec<&[u8]> = sh.iter().map(|part| bytemuck::cast_slice(part)).collect();
         Ok(Self {
             shape: source.shape_identity(),
-            count: narrow("gaussians", places)?,
+            count: narrow("gaussians", rows.len())?,
             sh_count: source.sh_count() as u32,
             brightest: brightest(source),
-            gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows), None)?,
-            sh: gpu.upload("sh", bytemuck::cast_slice(&sh), None)?,
+            gaussians: gpu.upload("gaussians", &[bytemuck::cast_slice(rows)], old_gaussians)?,
+            sh: gpu.upload("sh", &sh, old_sh)?,
             blocks: None,
+            merged: None,
             labels: None,
         })
     }
@@ -400,6 +425,13 @@ fn rows_of(source: &Gaussians) -> Vec<GaussianRow> {
     (0..source.len()).into_par_iter().with_min_len(1 << 14).map(row).collect()
 }
 
+/// Merged Gaussians as the shaders read them: the upper half of `source` is that of the sum.
+fn merged_rows(merged: &Merged) -> Vec<GaussianRow> {
+    let mut rows = rows_of(&merged.gaussians);
+    rows.iter_mut().zip(&merged.sums).for_each(|(row, sum)| row.source |= sum.to_bits());
+    rows
+}
+
 /// Scenes on the device, the most recently drawn last.
 #[derive(Debug)]
 pub(super) struct SceneCache {
@@ -414,36 +446,48 @@ impl SceneCache {
         Self { scenes: Vec::new(), bytes_max, blocks_from }
     }
 
-    /// The scene of `source`, uploaded once; if `labelled`, with the entries of `source`.
+    /// The scene of `source`, uploaded once; if `labelled`, with the entries of `source`, and if
+    /// `detailed`, with merged Gaussians where it has blocks: then it is uploaded again.
     /// Errors: `limit_exceeded` when it does not fit the adapter's limits or memory.
     pub(super) fn get(
         &mut self,
         gpu: &Gpu,
         source: &Gaussians,
         labelled: bool,
+        detailed: bool,
     ) -> Result<DeviceScene> {
         let shape = source.shape_identity();
-        let scene = match self.scenes.iter().position(|scene| scene.shape == shape) {
-            Some(at) => self.scenes.remove(at),
-            None => self.upload(gpu, source)?,
+        let held = self.scenes.iter().position(|scene| scene.shape == shape);
+        let scene = match held.map(|at| self.scenes.remove(at)) {
+            Some(scene) if !detailed || scene.blocks.is_none() || scene.merged.is_some() => scene,
+            coarse => {
+                if coarse.is_some() {
+                    drop(coarse);
+                    gpu.forget();
+                }
+                self.upload(gpu, source, detailed)?
+            }
         };
         let last = self.scenes.len();
         self.scenes.push(scene);
         let scene = &mut self.scenes[last];
         let labels_of = scene.labels.as_ref().map(|labels| labels.identity);
         if labelled && labels_of != Some(source.identity()) {
-            scene.labels = Some(DeviceLabels::upload(gpu, source)?);
+            let merged = scene.merged.as_deref();
+            scene.labels = Some(DeviceLabels::upload(gpu, source, merged)?);
         }
         Ok(scene.clone())
     }
 
     /// Uploads a scene. Others leave to make room, the least recently drawn first.
-    fn upload(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<DeviceScene> {
-        let scene = match DeviceScene::for_views(gpu, source, self.blocks_from) {
+    fn upload(&mut self, gpu: &Gpu, source: &Gaussians, detailed: bool) -> Result<DeviceScene> {
+        let from = self.blocks_from;
+        let upload = || DeviceScene::for_views(gpu, source, from, detailed);
+        let scene = match upload() {
             // The other scenes may hold the memory: drop them and try once more.
             Err(error) if error.code() == ErrorCode::LimitExceeded && !self.scenes.is_empty() => {
                 self.clear(gpu);
-                DeviceScene::for_views(gpu, source, self.blocks_from)?
+                upload()?
             }
             other => other?,
         };

@@ -51,8 +51,13 @@ impl Context {
         Ok(learnt.insert(scene).clone())
     }
 
-    /// The scene of `gaussians`; if `labelled`, with its entries.
-    pub(super) fn scene(&self, gaussians: &Gaussians, labelled: bool) -> Result<DeviceScene> {
-        self.on.scenes.lock().get(&self.on.gpu, gaussians, labelled)
+    /// The scene of `gaussians`; if `labelled`, with its entries; if `detailed`, with merged ones.
+    pub(super) fn scene(
+        &self,
+        gaussians: &Gaussians,
+        labelled: bool,
+        detailed: bool,
+    ) -> Result<DeviceScene> {
+        self.on.scenes.lock().get(&self.on.gpu, gaussians, labelled, detailed)
     }
 }

@@ -290,21 +290,25 @@ impl Gpu {
         })
     }
 
-    /// A storage buffer that holds `bytes`: `old`, where that has room for them.
+    /// A storage buffer that holds these parts, one after the other: `old`, where that has room
+    /// for them.
     pub(super) fn upload(
         &self,
         label: &'static str,
-        bytes: &[u8],
+        parts: &[&[u8]],
         old: Option<wgpu::Buffer>,
     ) -> Result<wgpu::Buffer> {
-        let buffer = match old.filter(|old| old.size() >= bytes.len() as u64) {
+        let size = parts.iter().map(|part| part.len() as u64).sum();
+        let buffer = match old.filter(|old| old.size() >= size) {
             Some(old) => old,
-            None => self.create_buffer(label, bytes.len() as u64, STORAGE)?,
+            None => self.create_buffer(label, size, STORAGE)?,
         };
         self.scoped(label, || {
-            for (chunk, bytes) in bytes.chunks(UPLOAD_CHUNK).enumerate() {
-                self.queue.write_buffer(&buffer, (chunk * UPLOAD_CHUNK) as u64, bytes);
+            let mut to = 0;
+            for bytes in parts.iter().flat_map(|part| part.chunks(UPLOAD_CHUNK)) {
+                self.queue.write_buffer(&buffer, to, bytes);
                 self.queue.submit([]);
+                to += bytes.len() as u64;
             }
         })?;
         Ok(buffer)

@@ -275,7 +275,8 @@ impl Internals<'_> {
                 picture_bytes: picture_bytes as u64,
                 ..BatchSizes::default()
             };
-            let scene = gaussians.map(|gaussians| context.scene(gaussians, false)).transpose()?;
+            let scene =
+                gaussians.map(|gaussians| context.scene(gaussians, false, false)).transpose()?;
             let room = context.scratch.room(&context.on.gpu, &need)?;
             let stage = Stage { on: context.on.clone(), room, row, scene };
             stage.write(&stage.room.views, &[row]);

@@ -466,7 +466,7 @@ impl Trainer for DeviceTrainer {
     fn render(&mut self, request: &RenderRequest) -> Result<Frame> {
         self.settle()?;
         // How bright its colours have become is not known here.
-        let request = &RenderRequest { error: 0.0, ..request.clone() };
+        let request = &RenderRequest { error: 0.0, detail: 0.0, ..request.clone() };
         let mut drawing = Drawing::new(self.origin, request, &self.scene)?;
         let rows = drawing.whole();
         self.tools().rows(&mut drawing, rows)?;

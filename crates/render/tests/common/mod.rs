@@ -7,8 +7,10 @@ use std::sync::OnceLock;
 
 use segsplat_core::scene::Gaussians;
 use segsplat_render::{
-    Frame, PixelWeights, RenderRequest, Renderer, RendererOptions, Switches, cpu::CpuRenderer,
-    gpu::GpuRenderer, oracle,
+    Frame, PixelWeights, RenderRequest, Renderer, RendererOptions, Switches,
+    cpu::CpuRenderer,
+    gpu::GpuRenderer,
+    oracle::{self, OraclePixel},
 };
 use segsplat_testing::labels::{Drawn, apart, draw_labels, table};
 use segsplat_testing::{
@@ -64,13 +66,27 @@ pub(crate) fn same(
     gaussians: &Gaussians,
     request: &RenderRequest,
 ) {
+    let truth =
+        |pixels: &[[u32; 2]]| oracle::render_pixels(gaussians, request, pixels).expect("the truth");
+    let name = format!("{name}: {} Gaussians", gaussians.len());
+    same_by(&name, got, want, request, truth);
+}
+
+/// The same, where the oracle's pixels are given by a function of their places.
+pub(crate) fn same_by(
+    name: &str,
+    got: &Frame,
+    want: &Frame,
+    request: &RenderRequest,
+    truth: impl Fn(&[[u32; 2]]) -> Vec<OraclePixel>,
+) {
     let (got, want) = (samples(got), samples(want));
     let one = Tolerance { mean: f64::INFINITY, ..Tolerance::GPU };
     let apart = |i: usize| compare(&got[i..=i], &want[i..=i], &[false], one).is_err();
     let far: Vec<usize> = (0..want.len()).filter(|&i| apart(i)).collect();
     let width = request.camera.intrinsics.width;
     let pixels: Vec<[u32; 2]> = far.iter().map(|&i| [i as u32 % width, i as u32 / width]).collect();
-    let truth = oracle::render_pixels(gaussians, request, &pixels).expect("the truth");
+    let truth = truth(&pixels);
     let mut cliff = vec![false; want.len()];
     for (&i, truth) in far.iter().zip(&truth) {
         cliff[i] = truth.cliff.any();
@@ -78,12 +94,8 @@ pub(crate) fn same(
     let found = compare(&got, &want, &cliff, Tolerance::GPU)
         .unwrap_or_else(|told| panic!("{name}: {told}"));
     println!(
-        "{name}: {} Gaussians, {} px: max {:.2e}, mean {:.2e}, {} flips",
-        gaussians.len(),
-        found.pixels,
-        found.max,
-        found.mean,
-        found.flips
+        "{name}, {} px: max {:.2e}, mean {:.2e}, {} flips",
+        found.pixels, found.max, found.mean, found.flips
     );
 }
 

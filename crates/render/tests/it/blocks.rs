@@ -115,7 +115,7 @@ fn blocks_hold_every_gaussian_once_and_bound_it() {
     for count in [1, BLOCK, BLOCK + 1, 5_000] {
         let gaussians = scattered(count, 3);
         let blocks = Blocks::of(&gaussians);
-        let mut seen = blocks.order.clone();
+        let mut seen: Vec<u32> = (0..blocks.own).flat_map(|at| blocks.ids(at).to_vec()).collect();
         seen.sort_unstable();
         assert!(seen.into_iter().eq(0..count as u32), "{count}: each once");
         for (at, bounds) in blocks.bounds.iter().enumerate() {
@@ -143,7 +143,7 @@ fn a_view_projects_little_more_than_it_shows() {
         let view = View::new(gaussians.origin(), &request).expect("a view");
         match Shown::of(&blocks, &Frustum::new(&view, &request)) {
             Shown::All => gaussians.len(),
-            Shown::Some(ids) => {
+            Shown::Some { ids, .. } => {
                 assert!(ids.is_sorted(), "the order of the scene");
                 ids.len()
             }

@@ -20,6 +20,7 @@ mod fuzz;
 mod growth;
 mod label_twins;
 mod labels;
+mod merged;
 mod one_pass;
 mod oracle;
 mod pitfalls;

@@ -146,10 +146,11 @@ fn structs_lie_in_memory_as_the_shaders_say() {
                 photos,
                 photos_widen,
                 block_count,
+                detail,
                 rest,
             ]
         ),
-        layout!(BlockRow, "Block", [center, reach, half, rest]),
+        layout!(BlockRow, "Block", [center, reach, half, error, parent, rest]),
         layout!(GaussianRow, "Gaussian", [mean, opacity, quat, scale, source]),
         layout!(
             FootprintRow,

@@ -12,6 +12,7 @@ mod networks;
 pub mod refinement;
 pub mod semantics;
 mod sets;
+pub mod words;
 
 pub use self::{
     loader::PipelineLoader,
@@ -94,6 +95,9 @@ impl Pipeline {
         {
             pipeline.masks()?;
             pipeline.image_text()?;
+            if pipeline.bundle.text_masks().is_some() {
+                pipeline.text_masks()?;
+            }
         }
         Ok(pipeline)
     }
