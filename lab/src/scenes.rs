@@ -180,7 +180,7 @@ pub(crate) fn recast(
     photos: &[PosedPhoto],
     options: &SceneOptions,
 ) -> Result<Option<(Vec<PosedPhoto>, Seen)>> {
-    pipeline::recast(engine, photos, options, SILENT)
+    pipeline::cameras::recast(engine, photos, options, SILENT)
 }
 
 static NEVER: AtomicBool = AtomicBool::new(false);

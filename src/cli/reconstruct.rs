@@ -178,7 +178,8 @@ fn refine(
         make_for_refinement(engine, photos, held, seen, silent)
     };
     let mut recast = || {
-        let Some((found, seen)) = pipeline::recast(engine, photos, options, silent)? else {
+        let Some((found, seen)) = pipeline::cameras::recast(engine, photos, options, silent)?
+        else {
             return Ok(None);
         };
         let poses = found.iter().map(|posed| posed.camera.camera_to_world).collect();

@@ -342,7 +342,7 @@ impl SceneNetworks for PipelineNetworks {
         options: &SceneOptions,
         watch: Watch<'_>,
     ) -> Result<Option<(Vec<PosedPhoto>, Seen)>> {
-        pipeline::recast(self.0.get()?, photos, options, watch)
+        pipeline::cameras::recast(self.0.get()?, photos, options, watch)
     }
 }
 

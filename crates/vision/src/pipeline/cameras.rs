@@ -12,8 +12,9 @@ use segsplat_cameras::{
 };
 
 use super::{
-    Pipeline, fraction,
+    Pipeline, Seen, fraction,
     networks::opened,
+    see,
     sets::{PhotoSet, UnposedSet, read_time},
 };
 use crate::{
@@ -26,8 +27,8 @@ use crate::{
     photos,
     scene::{
         Camera, CameraToWorld, CamerasReport, CamerasSource, LeftOutPhoto, Photo, PlacedPhoto,
-        PosedPhoto, SolvedCamera, Stage, StageTime, UnposedPhoto, Warning, WarningCode, Watch,
-        unless_cancelled,
+        PosedPhoto, SceneOptions, SolvedCamera, Stage, StageTime, UnposedPhoto, Warning,
+        WarningCode, Watch, unless_cancelled,
     },
 };
 
@@ -136,6 +137,26 @@ pub fn mended(
     let (keypoints, matches) = matched(pipeline, &pixels, watch)?;
     let cameras: Vec<Camera> = photos.iter().map(|posed| posed.camera).collect();
     pipeline.workers.install(|| mend(&cameras, &keypoints, &matches))
+}
+
+/// The photos where their keypoints say that their cameras stand ([`mended`]), and what the
+/// network says of them there; `None` where keypoints do not tell.
+///
+/// # Errors
+/// As [`super::reconstruct`].
+pub fn recast(
+    pipeline: &Pipeline,
+    photos: &[PosedPhoto],
+    options: &SceneOptions,
+    watch: Watch<'_>,
+) -> Result<Option<(Vec<PosedPhoto>, Seen)>> {
+    let Some(poses) = mended(pipeline, photos, watch)? else { return Ok(None) };
+    let mut photos = photos.to_vec();
+    for (posed, pose) in photos.iter_mut().zip(poses) {
+        posed.camera.camera_to_world = pose;
+    }
+    let seen = see(pipeline, &photos, options, watch)?;
+    Ok(Some((photos, seen)))
 }
 
 /// The solver's answer.

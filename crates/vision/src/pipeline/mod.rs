@@ -288,26 +288,6 @@ pub fn make_keeping(
     Ok((with_reading(made, photos), seen))
 }
 
-/// The photos where their keypoints say that their cameras stand ([`cameras::mended`]), and what the
-/// network says of them there; `None` where keypoints do not tell.
-///
-/// # Errors
-/// As [`reconstruct`].
-pub fn recast(
-    pipeline: &Pipeline,
-    photos: &[PosedPhoto],
-    options: &SceneOptions,
-    watch: Watch<'_>,
-) -> Result<Option<(Vec<PosedPhoto>, Seen)>> {
-    let Some(poses) = cameras::mended(pipeline, photos, watch)? else { return Ok(None) };
-    let mut photos = photos.to_vec();
-    for (posed, pose) in photos.iter_mut().zip(poses) {
-        posed.camera.camera_to_world = pose;
-    }
-    let seen = see(pipeline, &photos, options, watch)?;
-    Ok(Some((photos, seen)))
-}
-
 /// The scene of `photos` less those of the numbers `held`, and the same as one set that agrees
 /// (`front_photos` = 0), with which refinement begins; `seen` is what the network said of them all.
 ///

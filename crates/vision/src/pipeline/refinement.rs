@@ -269,8 +269,8 @@ impl Parts<'_, '_> {
         Ok(found)
     }
 
-    /// Leaves photos out from now on that the proof does not explain at all: their cameras cannot be
-    /// right. Whether there are some.
+    /// Leaves photos out from now on that the proof does not explain at all: their cameras cannot
+    /// be right. Whether there are some.
     fn leave_out(&mut self, start: &Scene, proof: &Gaussians) -> Result<bool> {
         let shares = unexplained(self.renderer, start, proof, &self.photos)?;
         let mut sorted = shares.clone();
@@ -382,8 +382,9 @@ impl Parts<'_, '_> {
         Ok(poses)
     }
 
-    /// Brings the camera of each photo but those of `held` to where the Gaussians of the others say,
-    /// and its own Gaussians with it: these look right from where it stands, wherever that is.
+    /// Brings the camera of each photo but those of `held` to where the Gaussians of the others
+    /// say, and its own Gaussians with it: these look right from where it stands, wherever that
+    /// is.
     fn settle_cameras(
         &mut self,
         held: &[usize],

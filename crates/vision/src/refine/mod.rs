@@ -279,9 +279,9 @@ pub fn differences(
     photos.iter().map(difference).collect()
 }
 
-/// How much of each photo `gaussians` do not explain, over what is behind those of `start`: the mean
-/// absolute difference after the best gain and bias of each channel, as a share of that of one plain
-/// colour. A photo whose camera stands elsewhere has about 1.
+/// How much of each photo `gaussians` do not explain, over what is behind those of `start`: the
+/// mean absolute difference after the best gain and bias of each channel, as a share of that of
+/// one plain colour. A photo whose camera stands elsewhere has about 1.
 ///
 /// # Errors
 /// What the renderer says.
@@ -448,9 +448,9 @@ pub fn refine(
     })
 }
 
-/// Where the cameras of photos stand so that they come closest to what `gaussians` show, over what
-/// is behind those of `start`: after so many steps for each that move nothing else. `pace` is called
-/// before each step.
+/// Where the cameras of photos stand so that they come closest to what `gaussians` show, over
+/// what is behind those of `start`: after so many steps for each that move nothing else. `pace`
+/// is called before each step.
 ///
 /// # Errors
 /// What the renderer or `pace` says.
