@@ -465,13 +465,13 @@ impl Service {
         let text = match (spec.kind.needs_semantics(), &record.semantics_sha256) {
             (false, _) => String::new(),
             (true, Some(_)) => {
-                let tag = record_semantics_tag(record);
+                let tag = record_semantics_tag(&scene);
                 text_key(&tag, ask.text.as_deref(), view.preset, &ask.scoring)?
             }
             (true, None) => return Ok(None),
         };
         let name = self.inner.backend.renderer.name();
-        view.etag(&record_tag(record), &name, spec.kind, &text).map(Some)
+        view.etag(&record_tag(&scene), &name, spec.kind, &text).map(Some)
     }
 
     /// Renders and encodes one view.
