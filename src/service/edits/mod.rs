@@ -21,6 +21,7 @@ use self::resolve::ResolvedEdits;
 pub use self::spec::{EditBox, EditOp, EditPick, EditSelection, EditSpec, EditSphere, SceneEdits};
 use super::{
     access::SceneAccess,
+    offline::OfflineService,
     search::SemanticScene,
     shared::{Service, Shared},
     tags::edits_tag,
@@ -243,6 +244,22 @@ impl Shared {
             (edited.counts.to_vec(), edited.scene.gaussians.len())
         };
         Ok(SceneEdits { edits: list.specs.clone(), counts, gaussians: gaussians as u64 })
+    }
+}
+
+impl OfflineService {
+    /// A scene after a list of edits, as [`Service::set_edits`] makes it, and what each took.
+    ///
+    /// # Errors
+    /// As there; `scene_not_ready` for texts and picks of a scene without semantics.
+    pub fn edit(&self, scene: &Arc<Scene>, specs: &[EditSpec]) -> Result<(Scene, SceneEdits)> {
+        resolve::check(specs, &self.limits)?;
+        let found = resolve::resolve(&self.backend, &self.limits, scene, specs)?;
+        let gaussians = found.gaussians.len() as u64;
+        let mut after = scene.after_edits(found.gaussians, String::new());
+        after.meta.report.gaussians = gaussians;
+        let took = SceneEdits { edits: specs.to_vec(), counts: found.counts, gaussians };
+        Ok((after, took))
     }
 }
 
