@@ -36,7 +36,7 @@ impl SceneAccess {
 
     /// The same scene, where it can be rendered.
     pub(super) fn finished(self) -> Result<Self> {
-        let access = self.is_done()?;
+        let access = self.done()?;
         match &access.edits {
             Ok(_) => Ok(access),
             Err(error) => Err(error.to_error()),
@@ -45,10 +45,10 @@ impl SceneAccess {
 
     /// The scene as it was made, without its edits, where that can be rendered.
     pub(super) fn unedited(self) -> Result<Self> {
-        Ok(Self { edits: Ok(Arc::default()), ..self.is_done()? })
+        Ok(Self { edits: Ok(Arc::default()), ..self.done()? })
     }
 
-    fn is_done(self) -> Result<Self> {
+    fn done(self) -> Result<Self> {
         let (status, id) = (&self.record.status, self.id());
         let not_ready = |why: String| Err(Error::new(ErrorCode::SceneNotReady, why));
         match (status.state, &status.error) {

@@ -3,11 +3,12 @@
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 
-use super::{access::SceneAccess, request::ScoringOptions};
+use super::request::ScoringOptions;
 use crate::{
     error::{Error, Result},
     names::hex,
     scene::{Preset, Scene, SceneId},
+    store::Record,
 };
 
 /// Values as text: equal text means equal values. Numbers are written to their last bit.
@@ -41,12 +42,11 @@ pub(super) fn edits_tag(base: &Scene, edits_sha256: &str) -> String {
     tag(&base.sha256, &base.meta.id, edits_sha256, &base.semantics_sha256)
 }
 
-/// The tag of the version and the edits that a record names. Others may be served a moment later.
-pub(super) fn record_tag(access: &SceneAccess) -> String {
-    let record = access.record();
+/// The tag of the version that a record names, after the edits of a list of this hash. Others may be served a moment later.
+pub(super) fn record_tag(record: &Record, edits_sha256: &str) -> String {
     let [scene, semantics] =
         [&record.scene_sha256, &record.semantics_sha256].map(|of| of.as_deref().unwrap_or(""));
-    tag(scene, access.id(), access.edits().sha256(), semantics)
+    tag(scene, &record.status.id, edits_sha256, semantics)
 }
 
 /// Tells a version of a scene and its semantics from all others.
@@ -55,9 +55,9 @@ pub(super) fn semantics_tag(scene: &Scene) -> String {
 }
 
 /// The same of the version that a record names.
-pub(super) fn record_semantics_tag(access: &SceneAccess) -> String {
-    let semantics = access.record().semantics_sha256.as_deref().unwrap_or_default();
-    format!("{} {semantics}", record_tag(access))
+pub(super) fn record_semantics_tag(record: &Record, edits_sha256: &str) -> String {
+    let semantics = record.semantics_sha256.as_deref().unwrap_or_default();
+    format!("{} {semantics}", record_tag(record, edits_sha256))
 }
 
 /// Without edits a view does not depend on the semantics; edits may take what they select.
