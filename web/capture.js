@@ -17,8 +17,6 @@ const isSplats = (path) =>
 const OTHER_PHOTO = /\.(hei[cf]|avif|dng|jxl)$/i;
 // Photos that the server reads and browsers do not.
 const ONLY_SERVER = /\.tiff?$/i;
-const AS_JPEG =
-  'export it as JPEG (iPhone: Settings, Camera, Formats, Most Compatible; a Mac: Preview, Export)';
 const fileName = (path) => path.split('/').pop();
 
 // All files of a drop, with the paths that they have in dropped folders.
@@ -68,10 +66,9 @@ async function readCapture(files, at) {
   if (others.length) {
     const first = others[0].path,
       kind = first.split('.').pop().toUpperCase(),
-      rest = others.length > 1 ? ` and ${others.length - 1} more` : '';
-    const told = photos.length ? notes : faults;
-    told.push(`${first}${rest}: ${kind} is a format that is not read; ${AS_JPEG}.`);
-  } else if (!photos.length) faults.push('No photos: add PNG, JPEG or WebP files.');
+      rest = others.length > 1 ? ` ${t('and.more', { count: others.length - 1 })}` : '';
+    (photos.length ? notes : faults).push(t('unread', { files: first + rest, kind }));
+  } else if (!photos.length) faults.push(t('photos.none'));
   const find = (test) => files.find(({ path }) => test.test(fileName(path)));
   const described = files.filter(({ path }) => CAMERAS.test(path) && !unread(path));
   const json =
@@ -92,8 +89,8 @@ async function readCapture(files, at) {
     // The server finds their cameras.
     const shown = photos.filter(({ path }) => !unread(path));
     for (const { path } of shown) rows.push({ name: path, faults: [] });
-    if (shown.length === 1) faults.push('One photo: a scene needs two or more.');
-    if (shown.length > 1) notes.push('No cameras: the server finds them from the photos.');
+    if (shown.length === 1) faults.push(t('photos.one'));
+    if (shown.length > 1) notes.push(t('cameras.none'));
     for (const { path, file } of await fit(shown, true, notes, at)) form.append(path, file, path);
     return capture;
   }
@@ -102,16 +99,16 @@ async function readCapture(files, at) {
     read = JSON.parse(await json.file.text());
     part = Array.isArray(read.cameras) ? 'cameras' : 'transforms';
     list = read.frames || read.cameras;
-    if (!Array.isArray(list) || !list.length) throw new Error('it has no list "frames"');
+    if (!Array.isArray(list) || !list.length) throw new Error(t('frames.none'));
   } catch (error) {
     faults.unshift(`${json.path}: ${error.message}`);
     return capture;
   }
   const [found, lost] = await paired(list, photos, rows);
   if (lost.length) {
-    const why = `${lost.length} of ${list.length} cameras have no photo here`;
-    if (found.length) notes.push(`${why}, as ${lost[0]}: they are left out.`);
-    else if (photos.length) faults.push(`${why}; the first is ${lost[0]}.`);
+    const which = { lost: lost.length, all: list.length, first: lost[0] };
+    if (found.length) notes.push(t('cameras.left', which));
+    else if (photos.length) faults.push(t('cameras.lost', which));
   }
   for (const { path, file, entry, size } of await fit(found, true, notes, at)) {
     // The lens is of the size that the photo had; cameras.json always says it.
@@ -163,27 +160,27 @@ async function paired(list, photos, rows) {
     const name = names[i],
       photo = photoOf[i],
       pose = entry.transform_matrix ?? entry.camera_to_world;
-    const row = { name: name || '(no name)', faults: [] };
+    const row = { name: name || t('nameless'), faults: [] };
     rows.push(row);
     if (!photo) {
-      row.note = 'no photo; it is left out';
+      row.note = t('row.photo');
       lost.push(row.name);
       continue;
     }
     const numbers = pose && pose.flat ? pose.flat(2) : [];
     if (![12, 16].includes(numbers.length) || !numbers.every(Number.isFinite)) {
-      row.faults.push('its pose is not a 4 by 4 matrix of numbers');
+      row.faults.push(t('row.pose'));
     }
     found.push({ path: name.replace(/^(\.\.?\/)+/, ''), file: photo.file, entry, row });
     try {
       if (!ONLY_SERVER.test(photo.path)) (await createImageBitmap(photo.file)).close();
     } catch {
-      row.faults.push('it cannot be read as a picture');
+      row.faults.push(t('row.picture'));
     }
   }
   for (const { path } of photos) {
     if (taken.has(path) || MASK.test(path)) continue;
-    rows.push({ name: path, faults: [], note: 'no camera; it is left out' });
+    rows.push({ name: path, faults: [], note: t('row.camera') });
   }
   return [found, lost];
 }
@@ -201,10 +198,7 @@ async function fit(photos, mayShrink, notes, at = () => {}) {
   if (before > limits.upload_bytes_max && photos.length > most) {
     const step = (photos.length - 1) / Math.max(most - 1, 1);
     sent = Array.from({ length: most }, (_, i) => photos[Math.round(i * step)]);
-    notes.push(
-      `${photos.length} photos have ${mb(before)}; ${sent.length} are sent, evenly chosen: ` +
-        'a scene takes no more.',
-    );
+    notes.push(t('photos.chosen', { all: photos.length, size: mb(before), sent: sent.length }));
   }
   if (!mayShrink) return sent;
   const all = bytes(sent) > limits.upload_bytes_max,
@@ -212,17 +206,13 @@ async function fit(photos, mayShrink, notes, at = () => {}) {
     fitted = [];
   let made = 0;
   for (const [i, photo] of sent.entries()) {
-    if (all) at(`making photos smaller: ${i + 1} of ${sent.length}`);
+    if (all) at(t('shrinking', { i: i + 1, all: sent.length }));
     const small = await smaller(photo.file, limits, all, kept).catch(() => null);
     if (small) made++;
     fitted.push({ ...photo, ...small });
   }
   if (made) {
-    const size = `${mb(bytes(sent))} became ${mb(bytes(fitted))}`;
-    notes.push(
-      `${made} photo${made === 1 ? ' was' : 's were'} made smaller before sending, to what the ` +
-        `server keeps of a photo: ${size}.`,
-    );
+    notes.push(t('shrunk', { n: made, before: mb(bytes(sent)), after: mb(bytes(fitted)) }));
   }
   return fitted;
 }

@@ -2,7 +2,7 @@
 // half-float buffers, then one pass that puts the backdrop, the words' colours or a depth picture
 // on the canvas.
 const ROW = 2048; // Gaussians a row of the texture
-const WORDS = [
+const TINTS = [
   [0.96, 0.36, 0.1],
   [0.1, 0.55, 0.98],
   [0.35, 0.75, 0.2],
@@ -125,7 +125,7 @@ const SHOW = `#version 300 es
 precision highp float; precision highp sampler2D;
 uniform sampler2D blended, first, second, backdrop;
 uniform mat3 turn; uniform vec4 lens; uniform vec2 size; uniform int kind, words;
-uniform vec4 margins; uniform float floorOf; uniform vec3 colors[4]; uniform bool sky;
+uniform vec4 margins; uniform float floorOf; uniform vec3 colors[4], fog; uniform bool sky;
 out vec4 shown;
 void main() {
   ivec2 cell = ivec2(gl_FragCoord.xy);
@@ -136,7 +136,8 @@ void main() {
   if (sky) {
     vec3 ray = vec3((place - lens.zw) / lens.xy, 1.) * turn;
     vec2 uv = vec2(atan(ray.x, ray.z) / 6.2831853, atan(ray.y, length(ray.xz)) / 3.14159265) + .5;
-    behind = textureLod(backdrop, uv, 0.).rgb;
+    vec4 far = textureLod(backdrop, uv, 0.);
+    behind = mix(fog, far.rgb, far.a); // what no photo saw fades
   }
   vec3 c = sum.rgb + (1. - sum.a) * behind;
   int best = -1;
@@ -150,7 +151,7 @@ void main() {
   if (kind == 2) c = vec3(sum.a);
   if (kind == 3) c = vec3(best >= 0 ? 1. : 0.);
   else if (best >= 0) c = mix(c, colors[best], .55);
-  else if (words > 0) c *= .5;
+  else if (words > 0) c = mix(fog, c, .5);
   shown = vec4(c, 1.);
 }`;
 
@@ -164,6 +165,7 @@ class Drawing {
     this.sent = this.done = this.stale = 0; // numbers of sorts
     this.waiting = [];
     this.asking = []; // who waits for what the worker measures, in turn
+    this.fog = [0, 0, 0]; // what a direction fades to that no photo saw
     this.gl = canvas.getContext('webgl2', { alpha: false, antialias: false });
     canvas.addEventListener('webglcontextlost', (e) => {
       e.preventDefault();
@@ -185,7 +187,7 @@ class Drawing {
   setup() {
     const gl = this.gl;
     if (!gl || !gl.getExtension('EXT_color_buffer_float')) {
-      throw new Error('this browser has no WebGL2 with float buffers; try a newer one');
+      throw new Error(t('device.old'));
     }
     const more = (text) => text.replace('es\n', 'es\n#define MORE\n');
     this.project = this.program(WHOLE, PROJECT);
@@ -253,10 +255,8 @@ class Drawing {
 
   fill(texture, format, width, height, type, data) {
     const gl = this.gl;
-    const of = format === gl.RGB8 ? gl.RGB : gl.RGBA;
-    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, of, type, data);
+    gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, gl.RGBA, type, data);
   }
 
   // Makes room for that many Gaussians, 68 bytes each on the device: half as many as long as the
@@ -276,7 +276,7 @@ class Drawing {
       const [form, kind] = [gl.RED_INTEGER, gl.UNSIGNED_INT];
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, ROW, this.rows, 0, form, kind, null);
       if (gl.getError() !== gl.OUT_OF_MEMORY) return count;
-      if (count <= ROW) throw new Error('this device has no memory for a scene');
+      if (count <= ROW) throw new Error(t('device.full'));
       count >>= 1;
     }
   }
@@ -293,7 +293,7 @@ class Drawing {
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + k, gl.TEXTURE_2D, texture, 0);
     });
     gl.drawBuffers([gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1]);
-    this.fill(this.backdrop, gl.RGB8, ...CELLS, gl.UNSIGNED_BYTE, cells);
+    this.fill(this.backdrop, gl.RGBA8, ...CELLS, gl.UNSIGNED_BYTE, fading(cells, header));
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
       gl.texParameteri(gl.TEXTURE_2D, side, gl.LINEAR);
     }
@@ -436,7 +436,7 @@ class Drawing {
     this.resize(width, height);
     for (this.sort(camera); !this.settled; this.sort(camera))
       await new Promise((go) => this.waiting.push(go));
-    if (this.lost) throw new Error('The graphics device is lost.');
+    if (this.lost) throw new Error(t('device.lost'));
     this.draw(camera, kind);
   }
 
@@ -509,7 +509,8 @@ class Drawing {
       show.margins,
       [0, 1, 2, 3].map((k) => (this.words[k] ? margin(this.words[k]) : 0)),
     );
-    gl.uniform3fv(show.colors, WORDS.flat());
+    gl.uniform3fv(show.colors, TINTS.flat());
+    gl.uniform3fv(show.fog, this.fog);
     gl.uniform1i(show.sky, header.backdrop ? 1 : 0);
     gl.bindVertexArray(this.none);
     gl.drawArrays(gl.TRIANGLES, 0, 3);

@@ -12,6 +12,27 @@ function onTurntable({ eye, target, up, fov }, axis, motion, share) {
   return { eye: add(target, turn(add(eye, target, -1))), target, up: turn(up), fov };
 }
 
+// The camera at a share of the way past some views: a curve through their places (Catmull and Rom)
+// that is at each of them for a moment.
+function onPath(views, share) {
+  const at = share * (views.length - 1),
+    i = Math.min(Math.floor(at), views.length - 2),
+    s = at - i,
+    [a, b, c, d] = [-1, 0, 1, 2].map((k) => views[Math.min(views.length - 1, Math.max(0, i + k))]);
+  const through = (name) =>
+    b[name].map((from, k) => {
+      const [p, q, r] = [a[name][k], c[name][k], d[name][k]];
+      const [bend, twist] = [2 * p - 5 * from + 4 * q - r, 3 * from - p - 3 * q + r];
+      return from + 0.5 * s * (q - p + s * (bend + s * twist));
+    });
+  return {
+    eye: through('eye'),
+    target: through('target'),
+    up: unit(mix(b.up, c.up, s)),
+    fov: b.fov + s * (c.fov - b.fov),
+  };
+}
+
 // The picture of the stage with the longer side given; even, because colours have half the pixels.
 function filmSize(box, side) {
   const scale = side / Math.max(box.width, box.height);
@@ -81,8 +102,7 @@ async function makeFilm(drawing, cameraAt, plan) {
 async function recordFilm(drawing, cameraAt, { width, height, frames, kind, signal, progress }) {
   const types = ['video/webm;codecs=vp9', 'video/webm', 'video/mp4'];
   const mimeType = types.find((type) => globalThis.MediaRecorder?.isTypeSupported(type));
-  if (!mimeType || !drawing.canvas.captureStream)
-    throw new Error('This browser can neither encode nor record video.');
+  if (!mimeType || !drawing.canvas.captureStream) throw new Error(t('film.cannot'));
   const long = (frames * 1000) / FPS,
     shown = () => new Promise((ok) => requestAnimationFrame(ok));
   await drawing.still(cameraAt(0), width, height, kind);

@@ -72,3 +72,39 @@ function behindOf(header, camera) {
   for (const [i] of costs.slice(0, front)) behind[i] = 0;
   return behind;
 }
+
+// The cells of the backdrop with a fourth number: how surely a photo saw what is far away in that
+// direction. All of a photo counts and a little beyond it; from there it falls off. Without photos,
+// as a file of Gaussians is, the backdrop stays.
+const SEEN_TO = 0.02, // beyond the edge of a photo, as the tangent of an angle
+  FADED_AT = 0.16;
+function fading(cells, header) {
+  const [across, down] = CELLS,
+    faded = new Uint8Array((cells.length / 3) * 4);
+  const lenses = header.cameras
+    .filter((_, i) => header.network_focal_px[i] > 0)
+    .map(({ camera_to_world: m, intrinsics: k }) => ({
+      axes: [0, 1, 2].map((j) => [m[j], m[4 + j], m[8 + j]]),
+      low: [-k.cx / k.fx, -k.cy / k.fy],
+      high: [(k.width - k.cx) / k.fx, (k.height - k.cy) / k.fy],
+    }));
+  for (let cell = 0; cell < faded.length / 4; cell++) {
+    const side = 2 * Math.PI * (((cell % across) + 0.5) / across - 0.5),
+      rise = Math.PI * ((Math.floor(cell / across) + 0.5) / down - 0.5),
+      ray = [Math.sin(side) * Math.cos(rise), Math.sin(rise), Math.cos(side) * Math.cos(rise)];
+    let beyond = lenses.length ? Infinity : 0;
+    for (const { axes, low, high } of lenses) {
+      const z = dot(axes[2], ray);
+      if (z <= 0.01) continue;
+      const off = [0, 1].map((j) => {
+        const at = dot(axes[j], ray) / z;
+        return Math.max(low[j] - at, at - high[j]);
+      });
+      beyond = Math.min(beyond, Math.max(...off));
+    }
+    const t = Math.min(1, Math.max(0, (FADED_AT - beyond) / (FADED_AT - SEEN_TO)));
+    faded.set(cells.subarray(3 * cell, 3 * cell + 3), 4 * cell);
+    faded[4 * cell + 3] = Math.round(255 * t * t * (3 - 2 * t));
+  }
+  return faded;
+}

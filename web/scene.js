@@ -42,7 +42,7 @@ async function readPacked(stream, head, part) {
       reader.cancel();
       return header;
     }
-    if (end) throw new Error('the scene ended early');
+    if (end) throw new Error(t('scene.short'));
   }
 }
 

@@ -14,7 +14,7 @@ const server = {
   async call(path, options = {}) {
     const headers = { ...this.headers, ...options.headers };
     const answer = await fetch(path, { ...options, headers }).catch((error) => {
-      throw error.name === 'AbortError' ? error : new Error('the server cannot be reached');
+      throw error.name === 'AbortError' ? error : new Error(t('server.gone'));
     });
     if (answer.ok) return answer;
     const fault = await answer.json().catch(() => ({}));
@@ -45,7 +45,7 @@ const server = {
       for (const [name, value] of Object.entries(this.headers))
         request.setRequestHeader(name, value);
       request.upload.onprogress = (e) => e.lengthComputable && sent(e.loaded / e.total);
-      request.onerror = () => reject(new Error('the server cannot be reached'));
+      request.onerror = () => reject(new Error(t('server.gone')));
       request.onload = () => {
         let body = {};
         try {

@@ -4,8 +4,10 @@
 //! Every sixth photo from the fourth is a target. N of the others, spread evenly, are given. Views
 //! are whole photos of one set of Gaussians over the backdrop, without layers.
 
-use std::{path::PathBuf, sync::Arc, time::Instant};
+use std::{cell::RefCell, path::PathBuf, sync::Arc, time::Instant};
 
+use glam::DVec3;
+use segsplat_testing::scenes::Random;
 use serde_json::{Value, json};
 
 use crate::{
@@ -18,16 +20,16 @@ use crate::{
         Pipeline,
         refinement::{RefineCalls, refined},
     },
-    refine::{RefinedVersion, held_out},
+    refine::{ALIGNING_STEPS, RefinedVersion, aligned, held_out},
     refinements::Variant,
     render::{
         Background, Frame, Kinds, RenderRequest, Switches,
         plan::{default_near, served},
-        train::unit,
+        train::{pose::moved, unit},
     },
     rows::{Rows, ms, progress},
-    scene::{Camera, Gaussians, PosedPhoto, Scene, SceneOptions},
-    scenes::{is_posed, make_for_refinement, make_keeping, scene_of, use_of, view_request},
+    scene::{Camera, CameraToWorld, Gaussians, PosedPhoto, Scene, SceneOptions},
+    scenes::{is_posed, make_for_refinement, make_keeping, recast, scene_of, use_of, view_request},
     setup::Inputs,
 };
 
@@ -46,6 +48,10 @@ pub(crate) struct Args {
     /// A refinement to measure, as NAME=VALUE,...: `ms=5000,rate=2`; each is a row of its own
     #[arg(long, value_name = "NAME=VALUE,...")]
     refine: Vec<String>,
+    /// Also with the cameras of the given photos turned by so many degrees and moved by a share of
+    /// the median depth
+    #[arg(long, num_args = 2, value_names = ["DEGREES", "SHARE"])]
+    disturb: Option<Vec<f64>>,
     /// Folder whose files replace the built-in shaders
     #[arg(long)]
     shaders: Option<PathBuf>,
@@ -67,108 +73,187 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let scene_options = SceneOptions::default().with(&args.method)?;
     for (name, dir) in args.inputs.find(is_posed)? {
         let all = photo_files::read_dir(&dir, &Limits::default())?;
-        let (targets, given) = given(&all, args.inputs.photos);
-        if given.len() < 2 || targets.is_empty() {
+        let (targets, right) = given(&all, args.inputs.photos);
+        if right.len() < 2 || targets.is_empty() {
             return Err(Error::invalid(format!("{name}: {} photos are too few", all.len())));
         }
-        let begun = Instant::now();
-        let (made, seen) = make_keeping(&engine, &given, &scene_options)?;
-        let scene = scene_of(made);
-        let create_ms = ms(begun);
-        let (_, first) = make_for_refinement(&engine, &given, &[], &seen)?;
-        let one_set = |gaussians: &Gaussians, camera| {
-            let near = default_near(scene.meta.report.median_depth);
-            let background = Background::Backdrop(Arc::clone(&scene.backdrop));
-            let plain = RenderRequest::plain(camera, Kinds::COLOR, near);
-            renderer.render(gaussians, &RenderRequest { background, ..plain })
-        };
-        let judge =
-            |gaussians: &Gaussians| mean_psnr(&targets, |camera| one_set(gaussians, camera));
-        let similarity =
-            |gaussians: &Gaussians| mean_ssim(&targets, |camera| one_set(gaussians, camera));
-        let as_served = |camera| {
-            let plain = view_request(camera, Kinds::COLOR, scene.meta.report.median_depth);
-            renderer.render(&scene.gaussians, &served(&scene, plain))
-        };
-        let picture = |what: &str, frame: Frame| match &args.pictures {
-            Some(dir) => {
-                let file = dir.join(format!("{name}-{}-{what}.png", given.len()));
-                let size = targets[0].camera.intrinsics;
-                let saved = grid::color(&clamped(frame.color), size.width).save(file);
-                saved.map_err(|e| Error::internal(format!("a picture: {e}")))
+        let wrong = args.disturb.as_deref().map(|at| [at[0], at[1]]);
+        let mut median_depth = 1.0;
+        for wrong in [None].into_iter().chain(wrong.map(Some)) {
+            let given: Vec<PosedPhoto> = match wrong {
+                None => right.clone(),
+                Some([degrees, share]) => disturbed(&right, degrees, share * median_depth),
+            };
+            let begun = Instant::now();
+            let (made, seen) = make_keeping(&engine, &given, &scene_options)?;
+            let scene = scene_of(made);
+            let create_ms = ms(begun);
+            median_depth = scene.meta.report.median_depth;
+            let (_, first) = make_for_refinement(&engine, &given, &[], &seen)?;
+            let one_set = |gaussians: &Gaussians, camera| {
+                let near = default_near(scene.meta.report.median_depth);
+                let background = Background::Backdrop(Arc::clone(&scene.backdrop));
+                let plain = RenderRequest::plain(camera, Kinds::COLOR, near);
+                renderer.render(gaussians, &RenderRequest { background, ..plain })
+            };
+            let judge =
+                |gaussians: &Gaussians| mean_psnr(&targets, |camera| one_set(gaussians, camera));
+            let similarity =
+                |gaussians: &Gaussians| mean_ssim(&targets, |camera| one_set(gaussians, camera));
+            let as_served = |camera| {
+                let plain = view_request(camera, Kinds::COLOR, scene.meta.report.median_depth);
+                renderer.render(&scene.gaussians, &served(&scene, plain))
+            };
+            let picture = |what: &str, frame: Frame| match &args.pictures {
+                Some(dir) => {
+                    let file = dir.join(format!("{name}-{}-{what}.png", given.len()));
+                    let size = targets[0].camera.intrinsics;
+                    let saved = grid::color(&clamped(frame.color), size.width).save(file);
+                    saved.map_err(|e| Error::internal(format!("a picture: {e}")))
+                }
+                None => Ok(()),
+            };
+            let camera = targets[0].camera;
+            let photo = Frame { color: Some(unit(&targets[0].photo)), ..Frame::default() };
+            picture("photo", photo)?;
+            picture("served", as_served(camera)?)?;
+            let plain = json!({
+                "scene": name,
+                "use": use_of(&name),
+                "photos": given.len(),
+                "method": args.method,
+                "gaussians": scene.gaussians.len(),
+                "create_ms": create_ms,
+                "psnr": judge(&scene.gaussians)?,
+                "first_psnr": judge(&first)?,
+                "served_psnr": mean_psnr(&targets, as_served)?,
+                "disturb": wrong,
+                "peak_mib": peak_mib(),
+            });
+            if variants.is_empty() {
+                progress(&format!("{name}: {plain}"));
+                rows.push(json!({ "psnr_db": plain["psnr"] }), plain.clone())?;
             }
-            None => Ok(()),
-        };
-        let camera = targets[0].camera;
-        let photo = Frame { color: Some(unit(&targets[0].photo)), ..Frame::default() };
-        picture("photo", photo)?;
-        picture("served", as_served(camera)?)?;
-        let plain = json!({
-            "scene": name,
-            "use": use_of(&name),
-            "photos": given.len(),
-            "method": args.method,
-            "gaussians": scene.gaussians.len(),
-            "create_ms": create_ms,
-            "psnr": judge(&scene.gaussians)?,
-            "first_psnr": judge(&first)?,
-            "served_psnr": mean_psnr(&targets, as_served)?,
-            "peak_mib": peak_mib(),
-        });
-        if variants.is_empty() {
-            progress(&format!("{name}: {plain}"));
-            rows.push(json!({ "psnr_db": plain["psnr"] }), plain.clone())?;
-        }
-        for (text, variant) in &variants {
-            let mut row = plain.clone();
-            let mut remake = |held: &[usize]| {
-                Ok(variant.start(make_for_refinement(&engine, &given, held, &seen)?))
-            };
-            let mut paces = 0_u32;
-            let mut pace = |_: f32| {
-                paces += 1;
-                Ok(())
-            };
-            let (begun, cpu) = (Instant::now(), cpu_seconds());
-            // When each version came, and the version.
-            let mut versions: Vec<(f64, RefinedVersion)> = Vec::new();
-            let mut publish = |_: &Scene, version: &RefinedVersion| {
-                versions.push((ms(begun), version.clone()));
-                Ok(())
-            };
-            let (options, renderer) = (variant.options(), &*renderer);
-            let calls = RefineCalls { remake: &mut remake, pace: &mut pace, publish: &mut publish };
-            let found = refined(renderer, &scene, &given, &options, calls)?;
-            let refine_ms = ms(begun);
-            row["refine"] = json!(text);
-            row["asked_s"] = json!(variant.asked_s());
-            row["refine_ms"] = json!(refine_ms);
-            row["step_ms"] = json!(refine_ms / f64::from(paces.max(1)));
-            row["steps_made"] = json!(paces);
-            row["refine_cpu_s"] = json!(cpu_seconds() - cpu);
-            row["steps"] = json!(found.report.steps);
-            row["overfit"] = json!(found.overfit);
-            row["held_out"] = json!(held_out(given.len()));
-            row["own_psnr_before"] = json!(found.report.psnr_before);
-            row["own_psnr_after"] = json!(found.report.psnr_after);
-            // Where no version was better, what is served stays.
-            row["refined_psnr"] = plain["served_psnr"].clone();
-            let came = |(ms, version): &(f64, RefinedVersion)| {
-                let psnr = judge(&version.gaussians)?;
-                Ok(json!({ "ms": ms, "psnr": psnr, "report": version.report }))
-            };
-            row["versions"] = versions.iter().map(came).collect::<Result<Value>>()?;
-            if let Some((_, version)) = versions.last() {
-                row["refined_psnr"] = json!(judge(&version.gaussians)?);
-                row["refined_gaussians"] = json!(version.gaussians.len());
-                row["refined_ssim"] = json!(similarity(&version.gaussians)?);
-                picture(text, one_set(&version.gaussians, camera)?)?;
+            for (text, variant) in &variants {
+                let mut row = plain.clone();
+                // With the cameras that the photos have now.
+                let made_of = RefCell::new((given.clone(), seen.clone()));
+                let mut remake = |held: &[usize]| {
+                    let (photos, seen) = &*made_of.borrow();
+                    Ok(variant.start(make_for_refinement(&engine, photos, held, seen)?))
+                };
+                let mut recast = || {
+                    let Some((found, seen)) = recast(&engine, &given, &scene_options)? else {
+                        return Ok(None);
+                    };
+                    let poses = poses_of(&found);
+                    *made_of.borrow_mut() = (found, seen);
+                    Ok(Some(poses))
+                };
+                let mut paces = 0_u32;
+                let mut pace = |_: f32| {
+                    paces += 1;
+                    Ok(())
+                };
+                let (begun, cpu) = (Instant::now(), cpu_seconds());
+                // When each version came, and the version.
+                let mut versions: Vec<(f64, RefinedVersion)> = Vec::new();
+                let mut publish = |_: &Scene, version: &RefinedVersion| {
+                    versions.push((ms(begun), version.clone()));
+                    Ok(())
+                };
+                let (options, renderer) = (variant.options(), &*renderer);
+                // Where the cameras of all photos have moved together, so must those of targets.
+                let fitted = |gaussians: &Gaussians| -> Result<Value> {
+                    let no_wait = &mut || Ok(());
+                    let poses = aligned(
+                        renderer,
+                        &scene,
+                        gaussians,
+                        &targets,
+                        &options,
+                        ALIGNING_STEPS,
+                        no_wait,
+                    )?;
+                    let stand = |(target, pose): (&PosedPhoto, CameraToWorld)| {
+                        let camera = Camera { camera_to_world: pose, ..target.camera };
+                        PosedPhoto { camera, ..target.clone() }
+                    };
+                    let targets: Vec<PosedPhoto> = targets.iter().zip(poses).map(stand).collect();
+                    Ok(json!([
+                        mean_psnr(&targets, |camera| one_set(gaussians, camera))?,
+                        mean_ssim(&targets, |camera| one_set(gaussians, camera))?,
+                    ]))
+                };
+                let calls = RefineCalls {
+                    remake: &mut remake,
+                    recast: &mut recast,
+                    pace: &mut pace,
+                    publish: &mut publish,
+                };
+                let found = refined(renderer, &scene, &given, &options, calls)?;
+                let refine_ms = ms(begun);
+                row["refine"] = json!(text);
+                row["asked_s"] = json!(variant.asked_s());
+                row["refine_ms"] = json!(refine_ms);
+                row["step_ms"] = json!(refine_ms / f64::from(paces.max(1)));
+                row["steps_made"] = json!(paces);
+                row["refine_cpu_s"] = json!(cpu_seconds() - cpu);
+                row["steps"] = json!(found.report.steps);
+                row["overfit"] = json!(found.overfit);
+                row["pose_gain"] = json!(found.pose_gain);
+                row["moved"] = json!(found.report.cameras);
+                row["held_out"] = json!(held_out(given.len()));
+                row["own_psnr_before"] = json!(found.report.psnr_before);
+                row["own_psnr_after"] = json!(found.report.psnr_after);
+                // Where no version was better, what is served stays.
+                row["refined_psnr"] = plain["served_psnr"].clone();
+                let came = |(ms, version): &(f64, RefinedVersion)| {
+                    let psnr = judge(&version.gaussians)?;
+                    Ok(json!({ "ms": ms, "psnr": psnr, "report": version.report }))
+                };
+                row["versions"] = versions.iter().map(came).collect::<Result<Value>>()?;
+                if let Some((_, version)) = versions.last() {
+                    row["refined_psnr"] = json!(judge(&version.gaussians)?);
+                    row["refined_gaussians"] = json!(version.gaussians.len());
+                    row["refined_ssim"] = json!(similarity(&version.gaussians)?);
+                    row["fitted"] = fitted(&version.gaussians)?;
+                    row["off_degrees"] = json!(off_degrees(&version.poses, &right));
+                    row["off_recast"] = json!(off_degrees(&poses_of(&made_of.borrow().0), &right));
+                    row["off_degrees_given"] = json!(off_degrees(&poses_of(&given), &right));
+                    picture(text, one_set(&version.gaussians, camera)?)?;
+                }
+                progress(&format!("{name}: {row}"));
+                rows.push(json!({ "psnr_db": row["refined_psnr"] }), row)?;
             }
-            progress(&format!("{name}: {row}"));
-            rows.push(json!({ "psnr_db": row["refined_psnr"] }), row)?;
         }
     }
     Ok(())
+}
+
+/// Photos whose cameras are turned by so many degrees and moved by `way` world units, each about an
+/// axis and along a line of its own, the same in each run.
+fn disturbed(photos: &[PosedPhoto], degrees: f64, way: f64) -> Vec<PosedPhoto> {
+    let mut random = Random(40);
+    let wrong = |posed: &PosedPhoto| {
+        let [turn, shift] = [(); 2].map(|()| {
+            DVec3::from_array([(); 3].map(|()| f64::from(random.range(-1.0, 1.0)))).normalize()
+        });
+        let pose = &posed.camera.camera_to_world;
+        let camera_to_world = moved(pose, turn * degrees.to_radians(), shift * way);
+        PosedPhoto { camera: Camera { camera_to_world, ..posed.camera }, ..posed.clone() }
+    };
+    photos.iter().map(wrong).collect()
+}
+
+fn poses_of(photos: &[PosedPhoto]) -> Vec<CameraToWorld> {
+    photos.iter().map(|posed| posed.camera.camera_to_world).collect()
+}
+
+/// Mean angle of the cameras to the right ones, degrees.
+fn off_degrees(poses: &[CameraToWorld], right: &[PosedPhoto]) -> f64 {
+    let off = poses.iter().zip(poses_of(right)).map(|(pose, right)| pose.turn_to(&right));
+    off.sum::<f64>().to_degrees() / poses.len() as f64
 }
 
 /// The targets, and `count` of the other photos, spread evenly.

@@ -166,8 +166,8 @@ fn judge(
             best = Some(version_of(start, &scene, version)?);
             Ok(())
         };
-        let pace = &mut |_| Ok(());
-        let calls = RefineCalls { remake: &mut remake, pace, publish: &mut publish };
+        let (pace, recast) = (&mut |_| Ok(()), &mut || Ok(None));
+        let calls = RefineCalls { remake: &mut remake, recast, pace, publish: &mut publish };
         refined(renderer, &scene, &given, &variant.options(), calls)?;
         row["refined_psnr"] = row["psnr"].clone();
         if let Some(version) = &best {

@@ -174,6 +174,15 @@ pub(crate) fn make_for_refinement(
     pipeline::make_for_refinement(engine, photos, held, seen, SILENT)
 }
 
+/// The photos with cameras that their keypoints tell, and what the network says of them there.
+pub(crate) fn recast(
+    engine: &Pipeline,
+    photos: &[PosedPhoto],
+    options: &SceneOptions,
+) -> Result<Option<(Vec<PosedPhoto>, Seen)>> {
+    pipeline::recast(engine, photos, options, SILENT)
+}
+
 static NEVER: AtomicBool = AtomicBool::new(false);
 const SILENT: Watch<'static> = Watch { progress: &|_, _| (), cancel: &NEVER };
 

@@ -690,6 +690,9 @@ pub struct Method {
     /// K-Means makes the rows, with lambda, bank_rows and merge_cosine.
     #[prost(bool, optional, tag = "20")]
     pub tracks: ::core::option::Option<bool>,
+    /// What refinement does with the cameras of the photos.
+    #[prost(enumeration = "CameraUse", tag = "21")]
+    pub camera: i32,
 }
 /// One message of the upload.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -858,6 +861,23 @@ pub struct RefineReport {
     /// Gaussians of the version that is served.
     #[prost(uint64, tag = "7")]
     pub gaussians_after: u64,
+    /// How far the camera of each photo moved, in the order of the cameras; none where they stay as
+    /// they were given.
+    #[prost(message, repeated, tag = "8")]
+    pub cameras: ::prost::alloc::vec::Vec<MovedCamera>,
+    /// Photos that took no part, by file name: their cameras cannot be right.
+    #[prost(string, repeated, tag = "9")]
+    pub left_out: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+}
+/// How far a camera is from where it was given.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct MovedCamera {
+    /// Angle of its turn, degrees.
+    #[prost(double, tag = "1")]
+    pub degrees: f64,
+    /// Way of its centre, as a share of the scene's median depth.
+    #[prost(double, tag = "2")]
+    pub share: f64,
 }
 /// Why a scene failed.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1508,6 +1528,39 @@ impl CamerasMode {
             "CAMERAS_MODE_UNSPECIFIED" => Some(Self::Unspecified),
             "CAMERAS_MODE_AUTO" => Some(Self::Auto),
             "CAMERAS_MODE_SOLVE" => Some(Self::Solve),
+            _ => None,
+        }
+    }
+}
+/// What refinement does with the cameras of the photos.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum CameraUse {
+    /// As CAMERA_USE_MENDED.
+    Unspecified = 0,
+    /// They are learnt, where photos that are held out show that they are wrong.
+    Mended = 1,
+    /// They stay as they are.
+    Given = 2,
+}
+impl CameraUse {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "CAMERA_USE_UNSPECIFIED",
+            Self::Mended => "CAMERA_USE_MENDED",
+            Self::Given => "CAMERA_USE_GIVEN",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "CAMERA_USE_UNSPECIFIED" => Some(Self::Unspecified),
+            "CAMERA_USE_MENDED" => Some(Self::Mended),
+            "CAMERA_USE_GIVEN" => Some(Self::Given),
             _ => None,
         }
     }

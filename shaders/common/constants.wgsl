@@ -44,6 +44,8 @@ const PAIR_SUMS: u32 = 10u;
 const GRADIENT_WORDS: u32 = 12u;
 // Numbers of a photo's exposure, with its moments and the loss.
 const EXPOSURE_WORDS: u32 = 20u;
+// Workgroups that add up what the loss says of a camera.
+const POSE_GROUPS: u32 = 64u;
 // Cells of a backdrop.
 const BACKDROP_WIDTH: u32 = 128u;
 const BACKDROP_HEIGHT: u32 = 64u;

@@ -65,6 +65,9 @@ pub fn models_info(bundle: &Bundle, execution_provider: &str) -> Result<ModelsIn
             "image_text.image" => {
                 (1, bundle.image_text().map(|m| [m.image.size; 2]).into_iter().collect())
             }
+            "text_masks.image" => {
+                (1, bundle.text_masks().map(|m| [m.size; 2]).into_iter().collect())
+            }
             _ => (0, Vec::new()),
         };
         ModelInfo {

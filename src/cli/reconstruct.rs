@@ -2,12 +2,14 @@
 //! becomes a scene file, or a file of Gaussians for other programs.
 
 use std::{
+    borrow::Cow,
     fmt::Write as _,
     path::{Path, PathBuf},
     sync::{Arc, atomic::AtomicBool},
     time::Instant,
 };
 
+use parking_lot::Mutex;
 use serde_json::json;
 use sha2::{Digest, Sha256};
 
@@ -130,7 +132,9 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let id = id_of(&provenance);
     let made = made.into_scene(id, store::now_ms(), provenance);
     let mut scene = match (&refiner, &seen) {
-        (Some(refiner), Some(seen)) => refine(&engine, refiner, made, &photos, seen, watch)?,
+        (Some(refiner), Some(seen)) => {
+            refine(&engine, refiner, made, &photos, seen, &options, watch)?
+        }
         _ => made,
     };
     let for_others = splat_format(&path).is_some();
@@ -162,11 +166,25 @@ fn refine(
     scene: Scene,
     photos: &PhotoSet,
     seen: &Seen,
+    options: &SceneOptions,
     watch: Watch<'_>,
 ) -> Result<Scene> {
     let silent = Watch { progress: &|_, _| (), cancel: watch.cancel };
     let photos = &photos.photos;
-    let mut remake = |held: &[usize]| make_for_refinement(engine, photos, held, seen, silent);
+    // With the cameras that the photos have now.
+    let made_of = Mutex::new((Cow::Borrowed(&photos[..]), Cow::Borrowed(seen)));
+    let mut remake = |held: &[usize]| {
+        let (photos, seen) = &*made_of.lock();
+        make_for_refinement(engine, photos, held, seen, silent)
+    };
+    let mut recast = || {
+        let Some((found, seen)) = pipeline::recast(engine, photos, options, silent)? else {
+            return Ok(None);
+        };
+        let poses = found.iter().map(|posed| posed.camera.camera_to_world).collect();
+        *made_of.lock() = (Cow::Owned(found), Cow::Owned(seen));
+        Ok(Some(poses))
+    };
     let mut pace = |spent: f32| {
         (watch.progress)(Stage::Refine, spent);
         Ok(())
@@ -177,7 +195,12 @@ fn refine(
         Ok(())
     };
     let found = refiner.run(|renderer| {
-        let calls = RefineCalls { remake: &mut remake, pace: &mut pace, publish: &mut publish };
+        let calls = RefineCalls {
+            remake: &mut remake,
+            recast: &mut recast,
+            pace: &mut pace,
+            publish: &mut publish,
+        };
         refined(renderer, &scene, photos, how, calls)
     })?;
     Ok(best.unwrap_or_else(|| {

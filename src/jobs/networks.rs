@@ -1,6 +1,6 @@
 //! The networks of jobs: those of the bundle, or the stand-ins of a test.
 
-use std::sync::Arc;
+use std::sync::{Arc, atomic::AtomicBool};
 
 use crate::{
     error::{Error, ErrorCode, Result},
@@ -8,6 +8,7 @@ use crate::{
     pipeline::{
         self, PhotoSet, Pipeline, PipelineLoader, Reconstruction, Seen, UnposedSet,
         semantics::{SemanticsInput, label_photos},
+        words,
     },
     refine::split,
     scene::{Gaussians, Method, PosedPhoto, Scene, SceneOptions, Semantics, TextEmbedding, Watch},
@@ -129,6 +130,20 @@ pub trait SceneNetworks: Send + Sync {
         let one_set = made.gaussians.clone();
         Ok((made, one_set))
     }
+
+    /// The photos with cameras that their keypoints tell, and what the networks say of them there;
+    /// `None` where nothing tells.
+    ///
+    /// # Errors
+    /// As [`Self::make`].
+    fn recast(
+        &self,
+        _photos: &[PosedPhoto],
+        _options: &SceneOptions,
+        _watch: Watch<'_>,
+    ) -> Result<Option<(Vec<PosedPhoto>, Seen)>> {
+        Ok(None)
+    }
 }
 
 /// What the bundle compares texts with, and how.
@@ -171,6 +186,27 @@ pub trait SemanticNetworks: Send + Sync {
     /// # Errors
     /// `model_unavailable`, `internal`.
     fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>>;
+
+    /// Whether a network masks what a text says in the photos of a scene. Else texts are compared
+    /// with the scene's bank.
+    fn masks_texts(&self) -> bool {
+        false
+    }
+
+    /// Of each text the score at each Gaussian of a scene, thousandths, as that network finds it in
+    /// the scene's photos. On the calling thread.
+    ///
+    /// # Errors
+    /// `model_unavailable`, `invalid_request`, `cancelled`, `internal`.
+    fn find_words(
+        &self,
+        _photos: &[PosedPhoto],
+        _scene: &Scene,
+        _texts: &[String],
+        _cancel: &AtomicBool,
+    ) -> Result<Vec<Vec<u16>>> {
+        Err(Error::internal("no network masks texts"))
+    }
 
     /// Whether the semantics of a scene are best begun before the scene is made: they need its
     /// Gaussians only at the end, and do not take the processor from the job that makes it.
@@ -299,6 +335,15 @@ impl SceneNetworks for PipelineNetworks {
         let seen = seen.ok_or_else(lacks)?;
         pipeline::make_for_refinement(self.0.get()?, &photos.photos, held, seen, watch)
     }
+
+    fn recast(
+        &self,
+        photos: &[PosedPhoto],
+        options: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<Option<(Vec<PosedPhoto>, Seen)>> {
+        pipeline::recast(self.0.get()?, photos, options, watch)
+    }
 }
 
 impl SemanticNetworks for PipelineNetworks {
@@ -324,6 +369,22 @@ impl SemanticNetworks for PipelineNetworks {
 
     fn rivals(&self) -> Result<Arc<[Vec<f32>]>> {
         self.0.get()?.image_text()?.rivals()
+    }
+
+    fn masks_texts(&self) -> bool {
+        self.0.bundle().text_masks().is_some()
+    }
+
+    fn find_words(
+        &self,
+        photos: &[PosedPhoto],
+        scene: &Scene,
+        texts: &[String],
+        cancel: &AtomicBool,
+    ) -> Result<Vec<Vec<u16>>> {
+        let (cameras, gaussians) = (&scene.meta.cameras[..], &scene.gaussians);
+        let input = SemanticsInput { photos, cameras, gaussians };
+        words::find_words(self.0.get()?, &input, texts, cancel)
     }
 
     fn begin_early(&self, method: &Method) -> bool {

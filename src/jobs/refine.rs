@@ -8,6 +8,7 @@
 //! start begins it again.
 
 use std::{
+    borrow::Cow,
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -24,7 +25,10 @@ use super::{
 use crate::{
     error::Result,
     limits::Limits,
-    pipeline::refinement::{RefineCalls, refined, reported, version_of},
+    pipeline::{
+        PhotoSet,
+        refinement::{RefineCalls, refined, reported, version_of},
+    },
     refine::{RefineBudget, RefineOptions, RefinedVersion},
     scene::{
         Refine, RefineReport, RefineState, RefineStatus, Scene, SceneError, SceneId, SceneStatus,
@@ -174,14 +178,25 @@ impl Jobs {
         let options = refine_options(order.ms, &self.parts.limits.get());
         let scenes = &self.parts.scenes;
         // The networks run again where what they said is not here any more.
-        let mut seen = match self.uploads.take_seen(id) {
+        let seen = match self.uploads.take_seen(id) {
             Some(seen) => Some(seen),
             None => scenes.make_keeping(photos, &record.options, watch)?.1.map(Arc::new),
         };
+        // With the cameras that the photos have now.
+        let made_of = Mutex::new((Cow::Borrowed(photos), seen));
         let mut remake = |held: &[usize]| {
+            let (photos, seen) = &mut *made_of.lock();
             // Nothing needs it after all photos.
             let seen = if held.is_empty() { seen.take() } else { seen.clone() };
             scenes.make_for_refinement(photos, held, seen.as_deref(), &record.options, watch)
+        };
+        let mut recast = || {
+            let found = scenes.recast(&photos.photos, &record.options, watch)?;
+            let Some((found, seen)) = found else { return Ok(None) };
+            let poses = found.iter().map(|posed| posed.camera.camera_to_world).collect();
+            let photos = PhotoSet { photos: found, ..photos.clone() };
+            *made_of.lock() = (Cow::Owned(photos), Some(Arc::new(seen)));
+            Ok(Some(poses))
         };
         let mut told = 0.0;
         let mut pace = |spent: f32| {
@@ -194,7 +209,12 @@ impl Jobs {
         let mut publish =
             |start: &Scene, version: &RefinedVersion| self.publish(job, start, version);
         let found = self.parts.refiner.run(|renderer| {
-            let calls = RefineCalls { remake: &mut remake, pace: &mut pace, publish: &mut publish };
+            let calls = RefineCalls {
+                remake: &mut remake,
+                recast: &mut recast,
+                pace: &mut pace,
+                publish: &mut publish,
+            };
             refined(renderer, &scene, &photos.photos, &options, calls)
         })?;
         self.finish_refinement(job, &found.report)

@@ -4,7 +4,7 @@
 //!
 //! The record's `semantics` is the state of the job; watchers of the scene see its stages.
 
-use std::sync::Arc;
+use std::sync::{Arc, atomic::AtomicBool};
 
 use super::{
     bell::FOREVER,
@@ -16,7 +16,8 @@ use super::{
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::{
-        Scene, SceneError, SceneId, SceneState, SceneStatus, SemanticsState, SemanticsStatus, Stage,
+        Scene, SceneError, SceneId, SceneState, SceneStatus, SemanticsState, SemanticsStatus,
+        Stage, Watch,
     },
     store::{Record, side_by_side},
 };
@@ -111,6 +112,25 @@ impl Jobs {
             self.parts.store.put_record(record)
         });
         lost.map(drop)
+    }
+
+    /// Of each text the score at each Gaussian of a finished scene, as the network of text masks
+    /// finds it in the scene's photos; `None` where there is no such network or no photos. Blocks.
+    /// Fails as the network and the store do.
+    pub(crate) fn find_words(
+        &self,
+        scene: &Scene,
+        texts: &[String],
+    ) -> Result<Option<Vec<Vec<u16>>>> {
+        let (networks, report) = (&self.parts.semantics, &scene.meta.report);
+        if !networks.masks_texts() || !self.parts.keep_photos || report.file_format.is_some() {
+            return Ok(None);
+        }
+        let cancel = &AtomicBool::new(false);
+        let upload = self.upload(&scene.meta.id, Watch { progress: &|_, _| {}, cancel })?;
+        let photos = &upload.photos()?.photos;
+        let _room = self.room.take(photos.len(), self.parts.limits.get().photos_max, cancel)?;
+        networks.find_words(photos, scene, texts, cancel).map(Some)
     }
 
     /// The scene of a job, once it is made.

@@ -171,8 +171,8 @@ impl Service {
             let write = move || {
                 let gaussians = texts.gaussians();
                 let index = gaussians.semantic_index().to_vec();
-                let semantics = Semantics { index, ..(*texts.of.semantics).clone() };
-                scene_splats(format, &texts.of.scene, &gaussians, Some(&semantics))
+                let semantics = Semantics { index, ..(*texts.stored.semantics).clone() };
+                scene_splats(format, &texts.stored.scene, &gaussians, Some(&semantics))
             };
             blocking(write).await?
         });

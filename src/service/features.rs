@@ -151,7 +151,7 @@ impl Service {
         let tag = view.labels_key(&of.tag, &inner.backend.renderer.name())?;
         let etag = etag(&cache_key(&(tag, spec.kind, spec.options.preset, &spec.scoring))?);
         let how = ScoringChoice { preset: spec.options.preset, changes: spec.scoring };
-        let texts = inner.score(of, how, Vec::new(), deadline).await?;
+        let texts = inner.score_bank(of, how, Vec::new(), deadline).await?;
         let (drawn, limits) = (Arc::clone(&texts), self.limits());
         let demand = Demand::view(&self.caller, view.pixels());
         let draw = move |work: &mut Work| {

@@ -58,7 +58,7 @@ impl OfflineService {
         texts: &[String],
     ) -> Result<SceneTexts> {
         let how = ScoringChoice { preset, changes: changes.clone() };
-        SceneTexts::new(&self.backend, self.semantic_scene(scene, what)?, &how, texts)
+        SceneTexts::new(&self.backend, self.semantic_scene(scene, what)?, &how, texts, None)
     }
 
     fn semantic_scene(&self, scene: &Arc<Scene>, what: &str) -> Result<SemanticScene> {

@@ -9,24 +9,33 @@ use std::{
 
 use base64::{Engine as _, prelude::BASE64_STANDARD, write::EncoderWriter};
 use sha2::{Digest, Sha256};
+use tokio::sync::OnceCell;
 
-use super::types::QueryAnswer;
+use super::{shared::Service, tasks::blocking, types::QueryAnswer};
 use crate::{
     error::{Error, ErrorCode, Result},
     formats::{packed::write_packed, table::ExportFormat},
     render::plan::default_near,
+    sample::{self, SampleOptions},
     scene::Scene,
 };
 
 const SHELL: &str = include_str!("../../web/index.html");
 const STYLE: &str = include_str!("../../web/page.css");
 const SCRIPT: &str = concat!(
+    include_str!("../../web/words.js"),
     include_str!("../../web/math.js"),
     include_str!("../../web/scene.js"),
     include_str!("../../web/draw.js"),
     include_str!("../../web/film.js"),
     include_str!("../../web/server.js"),
     include_str!("../../web/capture.js"),
+    include_str!("../../web/state.js"),
+    include_str!("../../web/canvas.js"),
+    include_str!("../../web/find.js"),
+    include_str!("../../web/scenes.js"),
+    include_str!("../../web/ways.js"),
+    include_str!("../../web/keep.js"),
     include_str!("../../web/page.js"),
 );
 
@@ -35,15 +44,32 @@ const SCRIPT: &str = concat!(
 pub struct ViewerPage {
     /// The document.
     pub html: String,
-    /// Its Content-Security-Policy. Styles and scripts that are not the page's own do not run.
+    /// Its Content-Security-Policy, but for who may show it in a frame. Styles and scripts that
+    /// are not the page's own do not run.
     pub policy: String,
 }
 
 /// The page of the server.
 pub static VIEWER: LazyLock<ViewerPage> = LazyLock::new(|| {
-    let policy = format!("{}; form-action 'self'; frame-ancestors 'none'", policy("'self'"));
+    let policy = format!("{}; form-action 'self'", policy("'self'"));
     ViewerPage { html: around_data().concat().replace("<!--policy-->", ""), policy }
 });
+
+/// What the page offers for a first try.
+const SAMPLE: SampleOptions = SampleOptions { photos: 6, width: 400, height: 300, seed: 1 };
+
+impl Service {
+    /// Generated photos of a room with their cameras, as a zip that is an upload. Made when it is
+    /// first asked for.
+    ///
+    /// # Errors
+    /// `internal` where it cannot be made.
+    pub async fn sample(&self) -> Result<&'static [u8]> {
+        static ZIP: OnceCell<Vec<u8>> = OnceCell::const_new();
+        let made = async || blocking(|| sample::archive(&SAMPLE)).await?;
+        ZIP.get_or_try_init(made).await.map(Vec::as_slice)
+    }
+}
 
 /// What the page may do; `connect` is where it may call.
 fn policy(connect: &str) -> String {

@@ -102,7 +102,7 @@ impl Service {
         let deadline = inner.deadline(&spec.options);
         let how = ScoringChoice { preset: spec.options.preset, changes: spec.scoring };
         let texts = match of {
-            Some(of) => Some(inner.score(of, how, labels, deadline).await?),
+            Some(of) => Some(inner.score_bank(of, how, labels, deadline).await?),
             None => None,
         };
         let (shared, pixel) = (Arc::clone(inner), [spec.x, spec.y]);

@@ -331,7 +331,7 @@ mod tests {
         let spec = QuerySpec { camera, ..QuerySpec::default() };
         let view = query_view(&limits, &*scene, &spec).unwrap();
         let (of, asked) = (SemanticScene::new(scene).unwrap(), ["chair".to_owned()]);
-        let texts = SceneTexts::new(&backend, of, &ScoringChoice::default(), &asked).unwrap();
+        let texts = SceneTexts::new(&backend, of, &ScoringChoice::default(), &asked, None).unwrap();
         let answer = |work: &mut Work| answer(&texts, &limits, &spec, view.as_ref(), work);
         let whole = answer(&mut Work::default()).unwrap();
         assert_eq!((whole.results.len(), whole.results[0].gaussians), (1, 1));

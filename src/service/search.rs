@@ -1,17 +1,19 @@
 //! Texts and scenes: the data that views, queries, picks and exports need.
 //!
-//! A [`Backend`] keeps what earlier texts needed: embeddings, banks ready to be scored, connected
-//! components, and the weights of views. A [`SceneTexts`] is one scene, the texts for it, and how
-//! the bank scores them.
+//! A [`Backend`] keeps what earlier texts needed: embeddings, banks ready to be scored, words that
+//! a network masked in the photos, connected components, and the weights of views. A
+//! [`SceneTexts`] is one scene, the texts for it, and how the bank scores them.
 
 use std::{
     collections::{BTreeSet, HashMap},
     sync::{Arc, OnceLock},
 };
 
+use parking_lot::Mutex;
+
 use super::{
     request::ScoringOptions,
-    tags::{semantics_tag, text_key},
+    tags::{cache_key, etag, semantics_tag, text_key},
     times::{ViewTimes, staged},
     types::{KnownWord, TextWarning},
     words::KnownWords,
@@ -23,8 +25,12 @@ use crate::{
     limits::Limits,
     render::{Labels, PixelWeights, RenderRequest, Renderer},
     scene::{Gaussians, Preset, Scene, ScoringMethod, Semantics, TextEmbedding},
-    semantics::{Components, InstanceOptions, Scorer, Scoring, TextScores, ViewNorms},
+    semantics::{Components, InstanceOptions, Scorer, Scoring, TextScores, ViewNorms, WordBank},
 };
+
+/// Finds texts in the photos of a scene: of each one the score at each Gaussian, thousandths;
+/// `None` where that cannot be.
+pub(super) type FindWords<'a> = dyn Fn(&Scene, &[String]) -> Result<Option<Vec<Vec<u16>>>> + 'a;
 
 /// How a call wants texts to be scored.
 #[derive(Clone, Debug, Default)]
@@ -45,6 +51,12 @@ pub(super) struct Backend {
     embeddings: Cache<String, Arc<TextEmbedding>>,
     /// By scene, semantics and the choice of scoring, with what the choice came to; by bytes.
     scorers: Cache<String, (ScoringMethod, Arc<Scorer>)>,
+    /// Scores of texts that were found in photos, by scene and text; by bytes.
+    found: Cache<String, Arc<[u16]>>,
+    /// Banks of such texts, by scene and texts; by bytes.
+    worded: Cache<String, Arc<WordedScene>>,
+    /// Held by who finds texts in photos: who asks for the same ones waits for them.
+    finding: Mutex<()>,
     /// By scene and semantics; by bytes.
     components: Cache<String, Arc<Components>>,
     /// By scene, semantics, renderer and camera; by bytes.
@@ -64,6 +76,9 @@ impl Backend {
             words: KnownWords::new(words),
             embeddings: Cache::new(limits.texts_cached_max as u64),
             scorers: Cache::new(limits.scorers_cache_bytes_max),
+            found: Cache::new(limits.scorers_cache_bytes_max),
+            worded: Cache::new(limits.scorers_cache_bytes_max),
+            finding: Mutex::default(),
             components: Cache::new(limits.pieces_cache_bytes_max),
             views: Cache::new(limits.entries_cache_bytes_max),
         }
@@ -72,6 +87,11 @@ impl Backend {
     /// What the bundle lacks, `None` where nothing.
     pub(super) fn lacks(&self) -> Option<String> {
         self.networks.lacks()
+    }
+
+    /// Whether texts are found in the photos of a scene.
+    pub(super) fn masks_texts(&self) -> bool {
+        self.networks.masks_texts()
     }
 
     /// Embeddings of texts: known ones from memory, all others from one run of the network.
@@ -130,6 +150,75 @@ impl Backend {
         self.scorers.insert(key, made.clone(), bytes);
         Ok(made)
     }
+
+    /// Scores of texts at the Gaussians of a scene, found in its photos by `find` where they are
+    /// not known; `None` where that cannot be.
+    fn found(
+        &self,
+        of: &SemanticScene,
+        texts: &[String],
+        find: &FindWords<'_>,
+    ) -> Result<Option<Vec<Arc<[u16]>>>> {
+        let key = |text: &String| format!("{} {text}", of.tag);
+        let known = |text: &String| self.found.find(&key(text));
+        if let Some(all) = texts.iter().map(known).collect() {
+            return Ok(Some(all));
+        }
+        let _alone = self.finding.lock();
+        let unknown: BTreeSet<&String> =
+            texts.iter().filter(|text| known(text).is_none()).collect();
+        let unknown: Vec<String> = unknown.into_iter().cloned().collect();
+        let mut found = HashMap::new();
+        if !unknown.is_empty() {
+            let Some(new) = find(&of.scene, &unknown)? else { return Ok(None) };
+            for (text, scores) in unknown.into_iter().zip(new) {
+                let scores: Arc<[u16]> = scores.into();
+                self.found.insert(key(&text), Arc::clone(&scores), 2 * scores.len() as u64);
+                found.insert(text, scores);
+            }
+        }
+        let lost = || Error::internal("a text has no scores");
+        let scores =
+            |text: &String| found.get(text).cloned().or_else(|| known(text)).ok_or_else(lost);
+        texts.iter().map(scores).collect::<Result<_>>().map(Some)
+    }
+
+    /// A scene whose entries are texts that were found in its photos; `None` where that cannot be.
+    fn worded(
+        &self,
+        of: &SemanticScene,
+        texts: &[String],
+        find: &FindWords<'_>,
+    ) -> Result<Option<Arc<WordedScene>>> {
+        let key = cache_key(&(&of.tag, texts))?;
+        if let Some(known) = self.worded.find(&key) {
+            return Ok(Some(known));
+        }
+        let Some(found) = self.found(of, texts, find)? else { return Ok(None) };
+        let found: Vec<&[u16]> = found.iter().map(|scores| &**scores).collect();
+        let words = WordBank::new(&found, of.scene.gaussians.len())?;
+        let scoring = WordBank::method(f64::from(self.networks.phrases()?.coverage_floor));
+        let how = Scoring::new(&scoring, vec![words.canon], Arc::default())?;
+        let scorer = Arc::new(Scorer::new(&words.bank, Arc::new(how))?);
+        let bytes = 2 * words.index.len() as u64 + 8 * words.bank.rows.len() as u64;
+        let report = of.semantics.report.clone();
+        let (bank, index) = (words.bank, words.index);
+        let semantics = Arc::new(Semantics { bank, index, report, ..Semantics::default() });
+        let scene = Arc::new(of.scene.with_semantics(Arc::clone(&semantics))?);
+        let of = SemanticScene { scene, semantics, tag: etag(&key), load_ms: of.load_ms };
+        let made = Arc::new(WordedScene { of, scorer, scoring, texts: words.texts });
+        self.worded.insert(key, Arc::clone(&made), bytes);
+        Ok(Some(made))
+    }
+}
+
+/// A scene whose entries are combinations of texts that were found in its photos.
+struct WordedScene {
+    of: SemanticScene,
+    scorer: Arc<Scorer>,
+    scoring: ScoringMethod,
+    /// What scores each text.
+    texts: Vec<Vec<f32>>,
 }
 
 /// A text, how the bank scores it, what is known of its word, and what makes that doubtful.
@@ -222,7 +311,10 @@ impl SemanticScene {
 /// A scene and its scored texts. It is made once for a call, and needs no network afterwards.
 pub(super) struct SceneTexts {
     pub(super) backend: Arc<Backend>,
+    /// What the texts are scored with.
     pub(super) of: SemanticScene,
+    /// The scene as it is stored: another one where the texts were found in its photos.
+    pub(super) stored: SemanticScene,
     pub(super) scorer: Arc<Scorer>,
     pub(super) scoring: ScoringMethod,
     preset: Preset,
@@ -233,15 +325,23 @@ pub(super) struct SceneTexts {
 }
 
 impl SceneTexts {
-    /// Scores checked texts. Networks embed those that are not known. Blocks.
+    /// Scores checked texts. Networks embed those that are not known. With `find` and the scoring
+    /// of the default they are found in the scene's photos, where that can be. Blocks.
     pub(super) fn new(
         backend: &Arc<Backend>,
         of: SemanticScene,
         how: &ScoringChoice,
         texts: &[String],
+        find: Option<&FindWords<'_>>,
     ) -> Result<Self> {
         let score = || {
             let preset = how.preset.unwrap_or(of.scene.meta.report.method.preset);
+            let plain = preset == Preset::Default && how.changes == ScoringOptions::default();
+            if let Some(find) = find.filter(|_| plain && !texts.is_empty())
+                && let Some(worded) = backend.worded(&of, texts, find)?
+            {
+                return Self::worded(backend, of, preset, texts, &worded);
+            }
             let (scoring, scorer) = backend.scorer(&of, preset, &how.changes)?;
             let scored = |(text, embedding): (&String, Arc<TextEmbedding>)| {
                 let scores = scorer.text(&embedding.row)?;
@@ -256,10 +356,37 @@ impl SceneTexts {
             let embeddings = backend.embedded(texts)?;
             let texts = texts.iter().zip(embeddings).map(scored).collect::<Result<_>>()?;
             let (backend, changes) = (Arc::clone(backend), how.changes.clone());
-            Ok(Self { backend, of, scorer, scoring, preset, changes, texts, score_ms: 0.0 })
+            let (stored, score_ms) = (of.clone(), 0.0);
+            Ok(Self { backend, of, stored, scorer, scoring, preset, changes, texts, score_ms })
         };
         let (made, score_ms) = staged("score", score);
         Ok(Self { score_ms, ..made? })
+    }
+
+    /// Texts that were found in the scene's photos.
+    fn worded(
+        backend: &Arc<Backend>,
+        stored: SemanticScene,
+        preset: Preset,
+        texts: &[String],
+        worded: &WordedScene,
+    ) -> Result<Self> {
+        let scored = |(text, row): (&String, &Vec<f32>)| {
+            let scores = worded.scorer.text(row)?;
+            // What is known of a word is of the towers.
+            Ok(ScoredText { text: text.clone(), scores, known: None, warnings: Vec::new() })
+        };
+        Ok(Self {
+            backend: Arc::clone(backend),
+            of: SemanticScene { load_ms: stored.load_ms, ..worded.of.clone() },
+            stored,
+            scorer: Arc::clone(&worded.scorer),
+            scoring: worded.scoring.clone(),
+            preset,
+            changes: ScoringOptions::default(),
+            texts: texts.iter().zip(&worded.texts).map(scored).collect::<Result<_>>()?,
+            score_ms: 0.0,
+        })
     }
 
     /// What tells the first text, how it is scored and the scene from all others, in tags.
@@ -294,7 +421,7 @@ impl SceneTexts {
         for m in self.texts.iter().flat_map(ScoredText::selected).filter(|&m| m <= most) {
             chosen[usize::from(m)] = true;
         }
-        self.of.scene.gaussians.only(|i| chosen[usize::from(index[i])])
+        self.stored.scene.gaussians.only(|i| chosen[usize::from(index[i])])
     }
 
     /// A view's weights where they are still known; `key` tells the view from all others.

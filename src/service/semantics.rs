@@ -159,8 +159,23 @@ impl Shared {
     }
 
     /// Scores checked texts for a scene, before its views wait for the renderer: no view may wait
-    /// for a network there.
+    /// for a network there. Where a network masks texts they are found in the scene's photos; that
+    /// goes on when its caller has gone, so that it is there when the caller asks again.
     pub(super) async fn score(
+        self: &Arc<Self>,
+        of: SemanticScene,
+        how: ScoringChoice,
+        texts: Vec<String>,
+        deadline: Instant,
+    ) -> Result<Arc<SceneTexts>> {
+        if self.backend.masks_texts() {
+            return self.found_in_photos(of, how, texts, deadline).await;
+        }
+        self.score_bank(of, how, texts, deadline).await
+    }
+
+    /// Scores checked texts by the bank of a scene.
+    pub(super) async fn score_bank(
         &self,
         of: SemanticScene,
         how: ScoringChoice,
@@ -168,8 +183,27 @@ impl Shared {
         deadline: Instant,
     ) -> Result<Arc<SceneTexts>> {
         let backend = Arc::clone(&self.backend);
-        let score = move |_: &mut Work| SceneTexts::new(&backend, of, &how, &texts).map(Arc::new);
+        let score =
+            move |_: &mut Work| SceneTexts::new(&backend, of, &how, &texts, None).map(Arc::new);
         self.in_time(deadline, "the text", score).await
+    }
+
+    async fn found_in_photos(
+        self: &Arc<Self>,
+        of: SemanticScene,
+        how: ScoringChoice,
+        texts: Vec<String>,
+        deadline: Instant,
+    ) -> Result<Arc<SceneTexts>> {
+        let (inner, id) = (Arc::clone(self), of.scene.meta.id.clone());
+        let found = blocking(move || {
+            let find = |scene: &Scene, texts: &[String]| inner.jobs.find_words(scene, texts);
+            SceneTexts::new(&inner.backend, of, &how, &texts, Some(&find)).map(Arc::new)
+        });
+        tokio::time::timeout_at(deadline.into(), found).await.unwrap_or_else(|_late| {
+            let message = format!("scene {id}: its photos are searched for the text; ask again");
+            Err(Error::new(ErrorCode::SceneNotReady, message).retry_after_s(RETRY_AFTER_S))
+        })?
     }
 }
 

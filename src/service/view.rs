@@ -400,7 +400,7 @@ impl Shared {
 
     /// The text of a view, scored; `None` where the view needs no semantics.
     async fn score_ask(
-        &self,
+        self: &Arc<Self>,
         of: Option<SemanticScene>,
         ask: TextOptions,
         preset: Option<Preset>,

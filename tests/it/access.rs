@@ -463,6 +463,9 @@ async fn only_named_origins_may_call_from_a_page() {
     let own = format!("http://{}", stand.addr);
     let own = client.get(stand.url("/v1/scenes")).header("origin", own).send().await.unwrap();
     assert_eq!(own.status(), 200, "the server's own page");
+    let page = client.get(stand.url("/")).send().await.unwrap();
+    let policy = page.headers()["content-security-policy"].to_str().unwrap();
+    assert!(policy.ends_with("; frame-ancestors https://ours.example"), "{policy}");
     for door in both(stand.addr).await {
         assert_eq!(code(&call(&door, "ListScenes", "").await), "ok");
     }

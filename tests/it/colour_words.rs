@@ -149,6 +149,64 @@ async fn a_word_finds_its_thing_at_a_pose_between_the_photos() {
     assert_eq!(stages.len(), 4, "{semantics}");
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn a_word_is_found_in_the_photos_by_a_network_that_masks_texts() {
+    let from = Path::new("tests/fixtures/colours");
+    let bundle = tempfile::tempdir().unwrap();
+    for entry in std::fs::read_dir(from).unwrap() {
+        let entry = entry.unwrap();
+        std::fs::copy(entry.path(), bundle.path().join(entry.file_name())).unwrap();
+    }
+    let read = |name: &str| std::fs::read_to_string(from.join(name)).unwrap();
+    let manifest = read("bundle.toml") + &read("text_masks.toml");
+    std::fs::write(bundle.path().join("bundle.toml"), manifest).unwrap();
+    let configure = |config: &mut Config| {
+        configured(config);
+        config.bundle = Some(bundle.path().to_owned());
+    };
+    let mut config = Config::default();
+    configure(&mut config);
+    let Some(made) = parts(&config) else { return };
+    let server = TestServer::with(|config, parts| {
+        configure(config);
+        *parts = made;
+    })
+    .await;
+    let client = crate::common::client();
+    let post = client.post(server.url("/v1/scenes?wait_ms=120000")).multipart(form());
+    let scene = body(post.send().await.unwrap()).await.unwrap();
+    let at =
+        |path: &str| server.url(&format!("/v1/scenes/{}/{path}", scene["id"].as_str().unwrap()));
+    let get = async |path: &str| bytes(client.get(at(path)).send().await.unwrap()).await.unwrap();
+    let ask = async |asked: Value| {
+        body(client.post(at("query")).json(&asked).send().await.unwrap()).await.unwrap()
+    };
+
+    let view = "view?from=0&to=1&t=0.5&width=96&height=96&kind=mask&text=";
+    let score = iou(&get(&format!("{view}red")).await, 0.2);
+    assert!(score > 0.7, "the mask of `red` has IoU {score:.2} with the red square");
+    let texts = json!({ "texts": ["red", "grey", "green"], "camera": { "from": 0 } });
+    let answer = ask(texts).await;
+    let [red, grey, green] = [0, 1, 2].map(|i| &answer["results"][i]);
+    assert_eq!([&red["found"], &grey["found"], &green["found"]], [true, true, false], "{answer}");
+    // The network's own score, in the part and at the peak of the view.
+    let close = |of: &Value| (of.as_f64().unwrap() - 0.9).abs() < 0.02;
+    assert!(close(&red["parts"][0]["score"]) && close(&red["view"]["peak"]["relevancy"]), "{red}");
+    assert_eq!(answer["scoring"]["canon"], json!(["(no mask)"]), "{answer}");
+    let words = [red, grey].map(|word| word["gaussians"].as_u64().unwrap());
+    assert!(words[0] > 50 && words[1] > words[0], "{words:?}");
+    // Who changes how texts are scored asks the towers, and so do labels of a pick.
+    let towers = ask(json!({ "texts": ["red"], "tau": 9.0 })).await;
+    assert_ne!(towers["scoring"]["canon"], answer["scoring"]["canon"], "{towers}");
+    let pick = get("pick?from=0&x=16&y=16&label=red&label=grey").await;
+    let pick: Value = serde_json::from_slice(&pick).unwrap();
+    assert_eq!(pick["labels"].as_array().unwrap().len(), 2, "{pick}");
+    // A file of what the text selects has as many Gaussians, with the semantics of the scene.
+    let ply = get("export?format=ply&text=red").await;
+    let head = String::from_utf8_lossy(&ply[..200]).into_owned();
+    assert!(head.contains(&format!("element vertex {}\n", words[0])), "{head}");
+}
+
 #[test]
 fn the_command_line_asks_a_scene_that_was_made_with_its_semantics() {
     let mut config = Config::default();

@@ -69,7 +69,7 @@ const NOT_ON_THE_PAGE: Absent = &[
     ("get_edits", "the list of edits comes with the page that is being made anew"),
     ("set_edits", "the list of edits comes with the page that is being made anew"),
     ("refine_scene", "it takes the machine for minutes: an operator or a program asks for it"),
-    ("render_view", "the page draws the scene itself"),
+    ("render_view.*", "a small picture of what a photo shows, as the server draws it"),
     ("render_views", "the page draws the scene itself"),
     ("features", "arrays are for programs"),
     ("*.deadline_ms", "whoever looks can go away"),

@@ -208,7 +208,8 @@ async fn bad_edits_are_refused_by_name_value_and_bound_and_change_nothing() {
         (select(json!({ "text": "photo 0", "parts": [40] })), "edits[0].select.parts has 40"),
         (select(json!({ "pick": { "camera": { "from": 0 }, "x": 9000, "y": 1 } })), "x is 9000"),
         (
-            json!([{ "op": "keep", "select": { "sphere": { "center": [999, 0, 0], "radius": 1 } } }]),
+            json!([{ "op": "keep", "select": { "sphere": {
+                "center": [999, 0, 0], "radius": 1 } } }]),
             "edits[0] leaves nothing of the scene",
         ),
         (Value::Array(vec![good_edit(); 257]), "257"),

@@ -494,7 +494,8 @@ async fn health_models_and_the_viewer_answer_over_http_2_as_well() {
         let models = body(get("/v1/models").await).await.unwrap();
         assert_eq!((&models["bundle"], &models["renderer"]), (&"plane".into(), &"cpu".into()));
         let page = get("/").await;
-        assert!(page.headers().contains_key(header::CONTENT_SECURITY_POLICY));
+        let policy = page.headers()[header::CONTENT_SECURITY_POLICY].to_str().unwrap();
+        assert!(policy.ends_with("; frame-ancestors 'none'"), "{policy}");
         let page = page.text().await.unwrap();
         assert!(page.contains("/v1/scenes") && !page.contains("https://"), "the viewer page");
     }

@@ -29,6 +29,12 @@ def until(page: Page, test: str) -> None:
       ask(); }})""")
 
 
+def open_scenes(page: Page) -> None:
+    """Opens the panel with the list of scenes, where it is folded."""
+    if not page.locator("#side").is_visible():
+        page.click("#side-fold")
+
+
 def drop(page: Page, files: dict[str, bytes]) -> None:
     """Drops files onto the page as a person does."""
     given = {name: base64.b64encode(data).decode() for name, data in files.items()}

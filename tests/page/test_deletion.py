@@ -7,7 +7,7 @@ import urllib.error
 import urllib.request
 
 import pytest
-from acts import post, settled
+from acts import open_scenes, post, settled
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page, expect
 from served import ROOT
@@ -32,6 +32,7 @@ def there(url: str, scene: str) -> bool:
 def test_a_scene_is_deleted_by_keys_after_a_question(page: Page, url: str, doomed: str) -> None:
     page.goto(f"{url}/#scene={doomed}")
     settled(page)
+    open_scenes(page)
     name = f"Delete scene {doomed[:8]}"
     page.get_by_role("button", name=name).focus()
     page.keyboard.press("Enter")
@@ -64,6 +65,7 @@ def test_a_scene_is_deleted_by_keys_after_a_question(page: Page, url: str, doome
 def test_another_scene_stays_open(page: Page, url: str, splats: str, doomed: str) -> None:
     page.goto(f"{url}/#scene={splats}")
     settled(page)
+    open_scenes(page)
     page.get_by_role("button", name=f"Delete scene {doomed[:8]}").click()
     page.get_by_role("button", name="Delete for ever").click()
     expect(page.locator("#says")).to_have_text(f"Scene {doomed[:8]} is deleted.")

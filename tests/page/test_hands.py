@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from acts import Camera, drop, pixels, sample, settled, until
+from acts import Camera, drop, open_scenes, pixels, sample, settled, until
 from playwright.sync_api import CDPSession, Page, expect
 
 CLOSE = {"rtol": 0.02, "atol": 1e-6}
@@ -207,6 +207,7 @@ def test_nothing_of_a_scene_stays_beside_the_next(page: Page, url: str, scene: s
     expect(page.locator("#words li strong")).to_have_text(["box"])
     page.click("#save")
     expect(page.locator("#kept li")).to_have_count(1)
+    open_scenes(page)
     page.click(f"#scenes button[data-id='{splats}']")
     expect(page.locator("#says")).to_contain_text("40 Gaussians")
     for left in ["#words li", "#kept li"]:

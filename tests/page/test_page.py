@@ -58,6 +58,9 @@ def test_photos_are_dropped_and_the_scene_is_flown_asked_clicked_shared_and_kept
     # A click.
     page.locator("#view").click(position={"x": 360, "y": 130})
     expect(page.locator("#picked")).to_contain_text("from the camera")
+    expect(page.locator("#words li")).to_have_count(2)
+    page.keyboard.press("Escape")
+    expect(page.locator("#words li")).to_have_count(1)
     # The link has scene, pose and word: another page shows the same.
     page.click("#share")
     before, link = pixels(page), page.url

@@ -6,8 +6,8 @@ import json
 import urllib.request
 from pathlib import Path
 
-from acts import post, sample, settled, until
-from playwright.sync_api import Page
+from acts import pixels, post, sample, settled, until
+from playwright.sync_api import Page, Route, expect
 from served import run
 
 
@@ -30,3 +30,32 @@ def test_a_better_version_is_shown_and_the_view_stays(page: Page, url: str, tmp_
     with urllib.request.urlopen(f"{url}/v1/scenes/{scene}") as answer:
         assert json.load(answer)["version"] > 1
     assert page.evaluate("segsplat.drawing.count") == better
+
+
+def test_the_first_version_is_shown_again_with_what_was_gained(
+        page: Page, url: str, splats: str) -> None:
+    told = [{"event": "done"}, {"event": "version", "version": 2, "fraction": 1.0}]
+    lines = "".join(f"data: {json.dumps(one)}\n\n" for one in told)
+
+    def refined(route: Route) -> None:
+        scene = route.fetch().json()
+        scene["refinement"]["state"] = "running"
+        scene["report"]["refinement"] = {"psnr_before": 21.04, "psnr_after": 24.96}
+        route.fulfill(json=scene)
+
+    page.route(f"**/v1/scenes/{splats}", refined)
+    page.route("**/events", lambda route: route.fulfill(
+        body=lines, headers={"content-type": "text/event-stream"}))
+    page.goto(f"{url}/#scene={splats}")
+    expect(page.locator("#says")).to_have_text("A better version: 40 Gaussians")
+    settled(page)
+    page.click("#report summary")
+    expect(page.locator("#gain-says")).to_contain_text("21.0 → 25.0 dB")
+    page.evaluate("segsplat.state.scene.newest = true")
+    before = page.locator("#before")
+    for pressed in ["true", "false"]:
+        before.click()
+        expect(before).to_have_attribute("aria-pressed", pressed)
+        settled(page)
+        assert page.evaluate("Boolean(segsplat.state.scene.newest)") == (pressed == "false")
+        assert pixels(page).std() > 10, "the canvas is flat"

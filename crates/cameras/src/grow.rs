@@ -434,7 +434,7 @@ pub(crate) fn angle_between(a: &Vector3<f64>, b: &Vector3<f64>) -> f64 {
 }
 
 /// The point nearest to rays (centre and unit direction).
-fn nearest_to(rays: &[(Vector3<f64>, Vector3<f64>)]) -> Option<Vector3<f64>> {
+pub(crate) fn nearest_to(rays: &[(Vector3<f64>, Vector3<f64>)]) -> Option<Vector3<f64>> {
     let mut sum = Matrix3::zeros();
     let mut right = Vector3::zeros();
     for (center, ray) in rays {

@@ -11,6 +11,7 @@ mod given;
 mod grow;
 mod judge;
 mod lens;
+mod mend;
 mod pairs;
 mod pose;
 mod report;
@@ -26,6 +27,7 @@ mod two_view;
 mod world;
 
 pub use given::{PairMatches, PhotoKeypoints, SolveOptions};
+pub use mend::mend;
 pub use pairs::pairs_to_match;
 pub use solution::{CONFIDENCE_MIN, Evidence, Placed, Placing, SeenPoint, Solution};
 pub use solve::solve;

@@ -7,11 +7,15 @@
 mod room;
 mod texture;
 
-use std::path::Path;
+use std::{
+    io::{Cursor, Write},
+    path::Path,
+};
 
 use glam::DVec3;
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use serde_json::json;
+use zip::{CompressionMethod, ZipWriter, result::ZipError, write::SimpleFileOptions};
 
 use crate::{
     error::{Error, Result},
@@ -177,6 +181,23 @@ pub fn upload(options: &SampleOptions) -> Result<Upload> {
         photos: png_files(&posed)?,
         ..Upload::default()
     })
+}
+
+/// The photos and their `transforms.json` as one zip, which is an upload as it is.
+///
+/// # Errors
+/// As [`photos`].
+pub fn archive(options: &SampleOptions) -> Result<Vec<u8>> {
+    let posed = photos(options)?;
+    let cameras = UploadFile { name: "transforms.json".to_owned(), bytes: transforms_json(&posed) };
+    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
+    let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
+    let unwritten = |e: ZipError| Error::internal("sample: no zip can be made").caused_by(e);
+    for UploadFile { name, bytes } in png_files(&posed)?.into_iter().chain([cameras]) {
+        zip.start_file(name, stored).map_err(unwritten)?;
+        zip.write_all(&bytes).map_err(|e| unwritten(e.into()))?;
+    }
+    Ok(zip.finish().map_err(unwritten)?.into_inner())
 }
 
 /// Writes the photos and `transforms.json` under `out_dir`. A missing folder is created.

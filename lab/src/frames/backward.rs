@@ -14,7 +14,7 @@ use crate::{
         DifferentiableRenderer, Kinds, RenderRequest,
         backward::{FrameGradients, Gradients},
         cpu::CpuRenderer,
-        train::{LearningRates, TrainingPhoto, TrainingSet, TrainingStep},
+        train::{LearningRates, PoseRates, TrainingPhoto, TrainingSet, TrainingStep},
     },
     rows::{Rows, median, ms},
     scene::{Gaussians, Photo},
@@ -115,12 +115,13 @@ fn trained(
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0..255")]
     let rgb = (0..bytes).map(|_| random.range(0.0, 255.0) as u8).collect();
     let photo = Photo { width: lens.width, height: lens.height, rgb, valid: None };
-    let photos = vec![TrainingPhoto { photo: &photo, request: request.clone() }];
+    let photos = vec![TrainingPhoto { photo: &photo, request: request.clone(), pose: 0 }];
     let ssim_share = RefineOptions::default().ssim_share;
     let set = TrainingSet { gaussians, photos, ssim_share, gaussians_max: 0 };
     let Some(mut trainer) = renderer.trainer(&set, u64::MAX)? else { return Ok(None) };
     let rates = LearningRates::default();
-    let step = TrainingStep { rates, exposure: 5e-3, opacity_min: 0.0 };
+    let step =
+        TrainingStep { rates, exposure: 5e-3, poses: PoseRates::default(), opacity_min: 0.0 };
     let mut times = Vec::new();
     for _ in 0..=steps {
         let begun = Instant::now();

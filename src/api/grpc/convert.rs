@@ -6,9 +6,9 @@ use super::pb;
 use crate::{
     error::{Error, Result, short},
     scene::{
-        CameraToWorld, CamerasMode, CamerasReport, CamerasSource, DropCount, HealthReport,
-        Intrinsics, LeftOutPhoto, PlacedPhoto, Refine, RefineReport, RefineState, ScoringMethod,
-        SemanticsReport, StageTime, Warning,
+        CameraToWorld, CameraUse, CamerasMode, CamerasReport, CamerasSource, DropCount,
+        HealthReport, Intrinsics, LeftOutPhoto, MovedCamera, PlacedPhoto, Refine, RefineReport,
+        RefineState, ScoringMethod, SemanticsReport, StageTime, Warning,
     },
     service::{
         BackgroundSpec, Boxes, CallerLimits, CameraSpec, Density, ERROR_FAST, Event, ExportFormat,
@@ -126,10 +126,13 @@ fn cameras_report(report: CamerasReport) -> pb::CamerasReport {
 }
 
 fn refine_report(report: RefineReport) -> pb::RefineReport {
+    let moved = |MovedCamera { degrees, share }| pb::MovedCamera { degrees, share };
     message!(RefineReport from report
         {
-            steps, seconds, held_out, psnr_before, psnr_after, gaussians_before, gaussians_after
+            steps, seconds, held_out, psnr_before, psnr_after, gaussians_before, gaussians_after,
+            left_out
         }
+        cameras: report.cameras.into_iter().map(moved).collect(),
     )
 }
 
@@ -252,6 +255,7 @@ fn method(method: &Method) -> pb::Method {
                 preset: pb::Preset::from(method.preset).into(),
                 density: pb::Density::from(method.density).into(),
                 mask_level: pb::MaskLevel::from(method.mask_level).into(),
+                camera: pb::CameraUse::from(method.camera).into(),
                 $($name: Some(method.$name),)+
             }
         };
@@ -272,6 +276,7 @@ pub(super) fn scene_options(header: &pb::CreateSceneHeader) -> Result<SceneOptio
                 preset: value("preset", method.preset)?,
                 density: given("density", method.density)?,
                 mask_level: given("mask_level", method.mask_level)?,
+                camera: given("camera", method.camera)?,
                 $($name: method.$name,)+
             }
         };
@@ -524,6 +529,7 @@ to_number! {
 
 both_ways! {
     CamerasMode = CamerasMode { Auto, Solve }
+    CameraUse = CameraUse { Mended, Given }
     SemanticsMode = Semantics { Lazy, Eager, Off }
     Density = Density { Thinned, Full }
     PictureKind = Kind { Color, Depth, Alpha, Semantics, Relevancy, Mask }

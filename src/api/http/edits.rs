@@ -40,8 +40,8 @@ pub(super) async fn get(
 /// Replace the edits of a scene
 ///
 /// The list is kept with the scene and applied, in its order, to the scene as it was made: in
-/// views, answers to texts, picks and exports. So a shorter list is an undo, and an empty one brings
-/// back every bit.
+/// views, answers to texts, picks and exports. So a shorter list is an undo, and an empty one
+/// brings back every bit.
 #[utoipa::path(
     put, path = "/v1/scenes/{id}/edits", operation_id = "set_edits", tag = "scenes", params(Id),
     request_body = EditsBody,

@@ -95,6 +95,7 @@ pub fn routes() -> Vec<Route> {
         ("GET", "/readyz", "ready", none, get(health::ready)),
         ("GET", "/openapi.json", "openapi", none, get(openapi::document)),
         ("GET", "/", "viewer", none, get(viewer::index)),
+        ("GET", "/sample.zip", "sample", read, get(viewer::sample)),
     ]
     .map(|(method, path, call, scope, handler)| Route { method, path, call, scope, handler })
     .into()

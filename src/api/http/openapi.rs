@@ -52,8 +52,9 @@ pub(super) async fn document(State(api): State<Api>) -> Json<Value> {
         edits::get, edits::set,
         render::view, views::views, texts::query, texts::pick, render::export, render::features,
         health::models, health::live, health::ready, health::metrics, document, viewer::index,
-        inference::server_metadata, inference::server_live, inference::server_ready,
-        inference::model_metadata, inference::model_ready, inference::model_infer,
+        viewer::sample, inference::server_metadata, inference::server_live,
+        inference::server_ready, inference::model_metadata, inference::model_ready,
+        inference::model_infer,
     ),
     components(schemas(ErrorBody, ProblemBody)),
     tags(

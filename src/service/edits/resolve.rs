@@ -57,7 +57,7 @@ pub(super) fn resolve(
             Asked::Place(place) => Selected { entries: None, within: vec![place] },
             Asked::Text { text, parts, scoring } => {
                 let how = ScoringChoice { preset: None, changes: scoring };
-                let scored = SceneTexts::new(backend, semantic(base, &at)?, &how, &[text])?;
+                let scored = SceneTexts::new(backend, semantic(base, &at)?, &how, &[text], None)?;
                 let entries = scored.texts.first().map_or_else(Vec::new, |text| text.selected());
                 let within = match parts {
                     None => Vec::new(),

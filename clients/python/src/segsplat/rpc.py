@@ -98,7 +98,7 @@ def _upload(
     method: MethodDescriptor, step: Request, fields: Mapping[str, Any]
 ) -> Iterator[Message]:
     """The header with options and cameras, then the files in pieces."""
-    enums = ("preset", "density", "mask_level", "semantics", "cameras_mode")
+    enums = ("preset", "density", "mask_level", "semantics", "cameras_mode", "camera")
     # The header has the cameras themselves under that name.
     if "cameras" in fields:
         fields = {**fields, "cameras_mode": fields["cameras"]}

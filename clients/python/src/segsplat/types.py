@@ -271,6 +271,9 @@ class SceneOptions(TypedDict, total=False):
     front_photos: int
     #: Whether a view that magnifies the photos blurs the Gaussians as the network learnt them.
     magnify: bool
+    #: What refinement does with the photos' cameras: "mended" learns them, where photos that are
+    #: held out show that they are wrong; "given" leaves them.
+    camera: Literal["mended", "given"]
 
 
 @dataclass(frozen=True)
@@ -314,6 +317,16 @@ class DropCount:
 
 
 @dataclass(frozen=True)
+class MovedCamera:
+    """How far a camera is from where it was given."""
+
+    #: Angle of its turn.
+    degrees: float
+    #: Way of its centre, as a share of the scene's median depth.
+    share: float
+
+
+@dataclass(frozen=True)
 class RefineReport:
     """What a refinement made of a scene."""
 
@@ -327,6 +340,10 @@ class RefineReport:
     psnr_after: float | None = None
     gaussians_before: int = 0
     gaussians_after: int = 0
+    #: How far the camera of each photo moved; empty where they stay as they were given.
+    cameras: tuple[MovedCamera, ...] = ()
+    #: Photos that took no part: their cameras cannot be right.
+    left_out: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

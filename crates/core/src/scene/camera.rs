@@ -248,6 +248,21 @@ impl CameraToWorld {
         Self(DMat4::from_cols(right, down, forward, center.extend(1.0)))
     }
 
+    /// From a rotation, which is brought to length 1 and right angles again, and the centre.
+    #[must_use]
+    pub fn from_rotation(rotation: DMat3, center: DVec3) -> Self {
+        let [x, y, z] = [rotation.x_axis, rotation.y_axis, rotation.z_axis];
+        let [x, y, z] = [x, y, z].map(|axis| axis.extend(0.0));
+        Self::orthonormalised(DMat4::from_cols(x, y, z, center.extend(1.0)))
+    }
+
+    /// Angle of the turn between the two, radians.
+    #[must_use]
+    pub fn turn_to(&self, other: &Self) -> f64 {
+        let [a, b] = [self, other].map(|pose| DQuat::from_mat3(&pose.rotation()));
+        a.angle_between(b)
+    }
+
     /// The matrix, camera to world.
     pub fn matrix(&self) -> DMat4 {
         self.0

@@ -27,7 +27,18 @@ pub enum CamerasSource {
     Solved,
 }
 
-display_names!(CamerasMode, CamerasSource);
+/// What refinement does with the cameras of the photos.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum CameraUse {
+    /// They are learnt, where photos that are held out show that they are wrong.
+    #[default]
+    Mended,
+    /// They stay as they are.
+    Given,
+}
+
+display_names!(CamerasMode, CamerasSource, CameraUse);
 
 /// A photo whose camera was solved.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]

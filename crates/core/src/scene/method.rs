@@ -10,7 +10,7 @@ use crate::{
     error::{Error, Result},
     limits::{BANK_ROWS_MAX, CANON_MAX, LAMBDA_RANGE, SCENE_PHOTOS_MAX, TAU_RANGE},
     names::display_names,
-    scene::{CamerasMode, Refine},
+    scene::{CameraUse, CamerasMode, Refine},
 };
 
 /// When the semantics of a scene are made.
@@ -198,6 +198,10 @@ method! {
     front_photos: u32 = 4, 0;
     /// Whether a view that magnifies the photos blurs the Gaussians as the network learnt them.
     magnify: bool = true, false;
+    /// Whether refinement learns where the photos' cameras stand, where photos that are held out
+    /// show that they are wrong: `mended`, or takes them as `given`.
+    [param(inline)]
+    camera: CameraUse = CameraUse::Mended, CameraUse::Given;
 }
 
 impl SceneOptions {

@@ -28,7 +28,7 @@ pub use axes::{covariance, principal_axes};
 pub use backdrop::Backdrop;
 pub use camera::{Camera, CameraToWorld, Intrinsics, ORTHONORMAL_TOLERANCE, Region};
 pub use cameras::{
-    CamerasMode, CamerasReport, CamerasSource, LeftOutPhoto, PlacedPhoto, SolvedCamera,
+    CameraUse, CamerasMode, CamerasReport, CamerasSource, LeftOutPhoto, PlacedPhoto, SolvedCamera,
 };
 pub use capture::{Capture, ViewSet};
 pub use edits::{Edit, EditAction, Edited, Editing, Place, Placement, Selected, edited};
@@ -41,7 +41,7 @@ pub use method::{
     Density, MaskLevel, Method, Preset, SceneOptions, ScoringMethod, SemanticsMode, with_pairs,
 };
 pub use photo::{Crop, CropShape, Photo, PosedPhoto, UnposedPhoto, photo_label};
-pub use refinement::{Refine, RefineReport, RefineState, RefineStatus};
+pub use refinement::{MovedCamera, Refine, RefineReport, RefineState, RefineStatus};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{
     Bank, BankMask, DenseFeatures, IndexMap, JudgedMasks, MaskInfo, MaskJudging, MaskLogits,

@@ -139,6 +139,22 @@ pub struct RefineReport {
     pub gaussians_before: u64,
     /// Gaussians of the version that is served.
     pub gaussians_after: u64,
+    /// How far the camera of each photo moved, in the order of the cameras; empty where they stay
+    /// as they were given.
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
+    pub cameras: Vec<MovedCamera>,
+    /// Photos that took no part, by file name: their cameras cannot be right.
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
+    pub left_out: Vec<String>,
+}
+
+/// How far a camera is from where it was given.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct MovedCamera {
+    /// Angle of its turn, degrees.
+    pub degrees: f64,
+    /// Way of its centre, as a share of the scene's median depth.
+    pub share: f64,
 }
 
 #[cfg(test)]

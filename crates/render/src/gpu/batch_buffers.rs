@@ -78,6 +78,8 @@ pub(super) struct TrainingBuffers {
     pub(super) by_windows: wgpu::Buffer,
     pub(super) partials: wgpu::Buffer,
     pub(super) moments: wgpu::Buffer,
+    /// Of the camera, of each workgroup that adds up.
+    pub(super) pose_sums: wgpu::Buffer,
 }
 
 /// A copy at the end of a submission.

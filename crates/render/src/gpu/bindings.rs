@@ -110,6 +110,7 @@ bound! { inputs;
     ByWindows = &inputs.training?.by_windows;
     Partials = &inputs.training?.partials;
     Moments = &inputs.training?.moments;
+    PoseSums = &inputs.training?.pose_sums;
     Earlier = inputs.earlier?;
 }
 
@@ -119,8 +120,8 @@ fn bound(kernel: Kernel) -> &'static [Bound] {
     use Bound::{
         Backdrops, Blocks, ByPictures, ByWindows, Colors, Dispatch, Earlier, Ends, Entries,
         Exposures, Footprints, Gaussians, Gradients, Lists, Moments, Nothing, Order, Pairs,
-        Partials, Photos, Pictures, Plans, Rows, Sh, Shaded, Slots, Sources, Starts, Sums, Table,
-        Touched, Training, Views,
+        Partials, Photos, Pictures, Plans, PoseSums, Rows, Sh, Shaded, Slots, Sources, Starts,
+        Sums, Table, Touched, Training, Views,
     };
     match kernel {
         Kernel::Cull => &[Views, Blocks, Order, Plans, Rows, Dispatch],
@@ -148,6 +149,7 @@ fn bound(kernel: Kernel) -> &'static [Bound] {
         Kernel::PhotoLoss =>
             &[Views, Training, Pictures, Photos, Exposures, ByWindows, Partials, ByPictures],
         Kernel::Exposure => &[Views, Training, Plans, Partials, Exposures],
+        Kernel::PoseGradient => &[Views, Gaussians, Gradients, PoseSums],
         Kernel::AddEarlier =>
             &[Views, Nothing, Nothing, Gradients, Nothing, Nothing, Nothing, Earlier],
         Kernel::Adam => &[Views, Training, Plans, Gradients, Gaussians, Sh, Moments],

@@ -38,6 +38,8 @@ shared! { pub(super) u32;
     GRADIENT_WORDS = 12;
     /// Numbers of a photo's exposure, with its moments and the loss.
     EXPOSURE_WORDS = 20;
+    /// Workgroups that add up what the loss says of a camera.
+    POSE_GROUPS = 64;
     /// Cells of a backdrop, across.
     BACKDROP_WIDTH = Backdrop::WIDTH as u32;
     /// Cells of a backdrop, down.
@@ -84,7 +86,7 @@ macro_rules! shader {
 }
 
 /// Every shader, in the order of the stages.
-pub const SHADERS: [Shader; 16] = [
+pub const SHADERS: [Shader; 17] = [
     shader!("cull", "cull"),
     shader!("project", "project", "rows", "camera", "tiles"),
     shader!("shade", "shade", "rows", "sh"),
@@ -107,6 +109,7 @@ pub const SHADERS: [Shader; 16] = [
     shader!("shade_backward", "shade_backward", "camera", "sh"),
     shader!("photo_loss", "photo_loss"),
     shader!("exposure", "exposure", "camera", "moments"),
+    shader!("pose", "pose"),
     shader!("adam", "adam", "camera", "moments"),
 ];
 
@@ -129,6 +132,7 @@ pub(super) enum Kernel {
     LossWindows,
     PhotoLoss,
     Exposure,
+    PoseGradient,
     AddEarlier,
     Adam,
 }
@@ -203,6 +207,7 @@ impl Kernel {
             Self::LossWindows => ("loss_windows", "photo_loss", ["windows"; 2]),
             Self::PhotoLoss => ("photo_loss", "photo_loss", ["main"; 2]),
             Self::Exposure => ("exposure", "exposure", ["main"; 2]),
+            Self::PoseGradient => ("pose", "pose", ["main"; 2]),
             Self::AddEarlier => ("add_earlier", "adam", ["add_earlier"; 2]),
             Self::Adam => ("adam", "adam", ["main"; 2]),
             Self::Rasterize(kinds) => {

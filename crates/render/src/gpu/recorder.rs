@@ -4,7 +4,7 @@ use super::{
     batch_buffers::BufferCopy,
     bindings::{Bindings, Inputs},
     device::Gpu,
-    pipelines::{GROUPS_X_MAX, Kernel, Kernels, RasterKinds, WORKGROUP_SIZE},
+    pipelines::{GROUPS_X_MAX, Kernel, Kernels, POSE_GROUPS, RasterKinds, WORKGROUP_SIZE},
     profile::Marks,
 };
 use crate::{
@@ -161,6 +161,11 @@ impl<'a> Recorder<'a> {
         self.tiles(Kernel::RasterizeBackward(kinds), tiles);
         self.gaussians(Kernel::ProjectBackward);
         self.gaussians(Kernel::ShadeBackward);
+    }
+
+    /// What the loss says of the camera of one view, after its backward pass.
+    pub(super) fn pose_gradient(&mut self) {
+        self.dispatch(Kernel::PoseGradient, [POSE_GROUPS, 1]);
     }
 
     /// Compares the picture of one whole view of `tiles` (columns, rows) with its photo: what that

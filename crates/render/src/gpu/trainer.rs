@@ -16,7 +16,7 @@ use super::{
     device::{Gpu, STORAGE},
     drawing::Drawing,
     frame::{ATTEMPTS_MAX, Batch, PLAN_BYTES, Tools},
-    pipelines::{EXPOSURE_WORDS, GRADIENT_WORDS, Kernel, PAIR_SUMS, RasterKinds},
+    pipelines::{EXPOSURE_WORDS, GRADIENT_WORDS, Kernel, PAIR_SUMS, POSE_GROUPS, RasterKinds},
     readback,
     scratch::Scratch,
 };
@@ -25,11 +25,12 @@ use crate::{
     backward::backward_request,
     constants::TILE_SIZE,
     error::{Error, Result},
-    scene::{Gaussians, Photo, RawGaussians},
+    scene::{CameraToWorld, Gaussians, Photo, RawGaussians},
     train::{
-        Exposure, LearningRates, Trainer, TrainingPhoto, TrainingSet, TrainingStep, absent, adam,
-        checked,
+        Exposure, LearningRates, PoseGradient, PoseRates, Trainer, TrainingPhoto, TrainingSet,
+        TrainingStep, absent, adam, checked,
         growth::{Origins, halves, most_blamed},
+        pose::Pose,
     },
 };
 
@@ -38,6 +39,9 @@ const ROW_BYTES: u64 = size_of::<TrainingRow>() as u64;
 const PAIR_BYTES: u64 = 16 + 4 * PAIR_SUMS as u64;
 /// Tile pairs of a Gaussian that are expected.
 const PAIRS_A_GAUSSIAN: u64 = 4;
+/// What comes back of a step: its plan, then what it says of the camera.
+const POSE_BYTES: u64 = 32 * POSE_GROUPS as u64;
+const TOLD_BYTES: u64 = PLAN_BYTES + POSE_BYTES;
 /// Photos that go up at once.
 const PHOTO_CHUNK_BYTES: u64 = 32 << 20;
 
@@ -74,6 +78,8 @@ struct Target {
     request: RenderRequest,
     /// Its first pixel.
     start: u32,
+    /// Number of its camera.
+    pose: usize,
 }
 
 /// A [`Trainer`] on a device, with buffers of its own.
@@ -94,22 +100,23 @@ pub(super) struct DeviceTrainer {
     /// Gradients of the photos before the last one of a step; there for steps of several.
     earlier: Option<wgpu::Buffer>,
     targets: Vec<Target>,
+    poses: Vec<Pose>,
     ssim_share: f32,
     /// Most tile pairs that a step has needed.
     isects: u32,
-    /// Where the plans of submissions come back, by turns.
-    plans: [wgpu::Buffer; 2],
+    /// Where what submissions tell comes back, by turns.
+    told: [wgpu::Buffer; 2],
     /// The last step, while it is not known whether it had room.
     pending: Option<Pending>,
 }
 
-/// A submission whose plan is not here yet.
+/// A submission of which nothing came back yet.
 #[derive(Debug)]
 struct Pending {
     photo_step: PhotoStep,
     /// Tile pairs that it had room for.
     capacity: u32,
-    plan: readback::PendingRead,
+    told: readback::PendingRead,
 }
 
 /// What a submission does: the photo that it draws, the step, whether it adds what earlier photos
@@ -133,8 +140,10 @@ struct DeviceStep<'a> {
     adds: bool,
     moves: bool,
     blames: bool,
-    /// Where its plan goes.
-    plan: &'a wgpu::Buffer,
+    /// Whether the camera is asked about, too.
+    poses: bool,
+    /// Where its plan goes, and what it says of the camera.
+    told: &'a wgpu::Buffer,
 }
 
 impl DeviceTrainer {
@@ -151,9 +160,9 @@ impl DeviceTrainer {
         }
         let numbers = 3 * set.gaussians.sh_count() as u64;
         let (mut targets, mut pixels, mut most) = (Vec::new(), 0_usize, [0_u32; 2]);
-        for TrainingPhoto { photo, request } in &set.photos {
+        for TrainingPhoto { photo, request, pose } in &set.photos {
             let start = narrow("pixels of photos", pixels)?;
-            targets.push(Target { request: backward_request(request), start });
+            targets.push(Target { request: backward_request(request), start, pose: *pose });
             pixels += photo.width as usize * photo.height as usize;
             most = [most[0].max(photo.width), most[1].max(photo.height)];
         }
@@ -170,10 +179,11 @@ impl DeviceTrainer {
             by_windows: storage("windows", 36 * u64::from(most[0]) * u64::from(most[1]))?,
             partials: storage("sums of the loss", 48 * tiles[0] * tiles[1])?,
             moments: storage("moments", moment_bytes(count, numbers))?,
+            pose_sums: storage("sums of the camera", POSE_BYTES)?,
         };
         let back = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
-        let plan = || gpu.create_buffer("plan of a step", PLAN_BYTES, back);
-        let plans = [plan()?, plan()?];
+        let told = || gpu.create_buffer("what a step tells", TOLD_BYTES, back);
+        let told = [told()?, told()?];
         put_photos(gpu, &training.photos, &set.photos)?;
         let mut exposure = [0.0_f32; EXPOSURE_WORDS as usize];
         exposure[..3].fill(1.0);
@@ -201,9 +211,10 @@ impl DeviceTrainer {
             training,
             earlier: None,
             targets,
+            poses: set.poses(),
             ssim_share: set.ssim_share,
             isects: 0,
-            plans,
+            told,
             pending: None,
             on,
         })
@@ -230,12 +241,27 @@ impl DeviceTrainer {
         if self.had_room(pending)? { Ok(()) } else { self.take(photo_step) }
     }
 
-    /// Waits for a submission; whether its tile pairs had room. If not, there is more for the next.
+    /// Waits for a submission; whether its tile pairs had room. If not, there is more for the next;
+    /// if so, the photo's camera moves.
     fn had_room(&mut self, submitted: Pending) -> Result<bool> {
-        let Pending { capacity, plan, .. } = submitted;
-        let plan: PlanRow = readback::wait(&self.on.gpu, plan, bytemuck::pod_read_unaligned)?;
+        let Pending { capacity, told, photo_step } = submitted;
+        let (plan, sums) = readback::wait(&self.on.gpu, told, |bytes| {
+            let (plan, sums) = bytes.split_at(PLAN_BYTES as usize);
+            let sums: Vec<[[f32; 4]; 2]> = bytemuck::pod_collect_to_vec(sums);
+            (bytemuck::pod_read_unaligned::<PlanRow>(plan), sums)
+        })?;
         self.isects = plan.needed.max(self.isects);
-        Ok(plan.needed <= capacity)
+        let had_room = plan.needed <= capacity;
+        let PhotoStep { at, step, .. } = photo_step;
+        if had_room && step.poses.moves() {
+            let sum = sums.iter().fold(PoseGradient::default(), |sum, [shift, turn]| {
+                let [shift, turn] = [shift, turn].map(|v| DVec3::from_slice(&v.map(f64::from)));
+                sum.plus(PoseGradient { turn, shift })
+            });
+            let pose = self.targets[at].pose;
+            self.poses[pose].step(&sum, step.poses);
+        }
+        Ok(had_room)
     }
 
     fn tools(&mut self) -> Tools<'_> {
@@ -248,7 +274,8 @@ impl DeviceTrainer {
     /// Submits the step of a photo, and asks for its plan.
     fn submit(&mut self, photo_step: PhotoStep) -> Result<Pending> {
         let PhotoStep { at, step, adds, moves, blames } = photo_step;
-        let target = self.targets.get(at).ok_or_else(|| absent(at))?.clone();
+        let mut target = self.targets.get(at).ok_or_else(|| absent(at))?.clone();
+        target.request.camera.camera_to_world = self.poses[target.pose].now;
         let rates = &step.rates;
         let row = TrainingRow {
             means: rates.means,
@@ -265,9 +292,10 @@ impl DeviceTrainer {
             blames: blames.into(),
         };
         // That of the step before may still be under way in the other.
-        self.plans.reverse();
-        let (plan, training) = (self.plans[0].clone(), self.training.clone());
+        self.told.reverse();
+        let (told, training) = (self.told[0].clone(), self.training.clone());
         let (earlier, origin) = (self.earlier.clone(), self.origin);
+        let poses = step.poses.moves();
         let step = DeviceStep {
             request: &target.request,
             row,
@@ -276,13 +304,14 @@ impl DeviceTrainer {
             adds,
             moves,
             blames,
-            plan: &plan,
+            poses,
+            told: &told,
         };
         let mut tools = self.tools();
         let capacity = tools.capacity(1);
         tools.train(origin, &step, capacity)?;
-        let plan = readback::ask(&self.on.gpu, &plan, PLAN_BYTES)?;
-        Ok(Pending { photo_step, capacity, plan })
+        let told = readback::ask(&self.on.gpu, &told, TOLD_BYTES)?;
+        Ok(Pending { photo_step, capacity, told })
     }
 
     /// Buffers from a byte on, and how many bytes, one after another.
@@ -326,7 +355,8 @@ impl DeviceTrainer {
         let earlier = self.earlier()?;
         // Nothing moves.
         let rates = LearningRates::default().scaled(0.0);
-        let step = TrainingStep { rates, exposure: 0.0, opacity_min: 0.0 };
+        let poses = PoseRates::default();
+        let step = TrainingStep { rates, exposure: 0.0, poses, opacity_min: 0.0 };
         for (place, &at) in photos.iter().enumerate() {
             self.take(PhotoStep { at, step, adds: place > 0, moves: false, blames: true })?;
         }
@@ -336,6 +366,11 @@ impl DeviceTrainer {
             let by: Vec<[f32; 3]> = bytemuck::pod_collect_to_vec(bytes);
             by.par_chunks(k).with_min_len(1 << 12).map(|by| by[0].iter().sum()).collect()
         })
+    }
+
+    /// Number of a photo's camera.
+    fn pose_of(&self, at: usize) -> Option<usize> {
+        self.targets.get(at).map(|target| target.pose)
     }
 
     /// Where the gradients of a photo are while those of the next are taken.
@@ -366,6 +401,11 @@ impl Trainer for DeviceTrainer {
         }
         let step = *step;
         if let [at] = *photos {
+            // Its camera must have moved by the step before.
+            let same = |last: &Pending| self.pose_of(last.photo_step.at) == self.pose_of(at);
+            if step.poses.moves() && self.pending.as_ref().is_some_and(same) {
+                self.settle()?;
+            }
             let next =
                 self.submit(PhotoStep { at, step, adds: false, moves: true, blames: false })?;
             let Some(last) = self.pending.replace(next) else { return Ok(()) };
@@ -466,6 +506,11 @@ impl Trainer for DeviceTrainer {
             rows.iter().map(read).collect()
         })
     }
+
+    fn poses(&mut self) -> Result<Vec<CameraToWorld>> {
+        self.settle()?;
+        Ok(self.poses.iter().map(|pose| pose.now).collect())
+    }
 }
 
 /// Rows and harmonics of places.
@@ -509,7 +554,7 @@ impl Tools<'_> {
     /// Draws, compares, goes back and moves, in one submission of one view with room for `capacity`
     /// tile pairs. Where the plan says that it needs more, nothing is moved.
     fn train(&mut self, origin: DVec3, step: &DeviceStep<'_>, capacity: u32) -> Result<()> {
-        let DeviceStep { request, training, earlier, adds, moves, blames, .. } = *step;
+        let DeviceStep { request, training, earlier, adds, moves, blames, poses, .. } = *step;
         let (gpu, scene) = (self.gpu, self.scene);
         let drawing = Drawing::new(origin, request, scene)?;
         let (tiles, layouts) = (drawing.tiles(), [drawing.layout(drawing.whole(), 0)]);
@@ -536,18 +581,24 @@ impl Tools<'_> {
             stages.draw(RasterKinds::from(request), tiles);
             stages.compare(tiles, !blames);
             stages.backward(Kinds::COLOR, tiles);
+            if poses {
+                stages.pose_gradient();
+            }
             if adds && earlier.is_some() {
                 stages.gaussians(Kernel::AddEarlier);
             }
-            let copy = |from, to, bytes| BufferCopy { from: (from, 0), to: (to, 0), bytes };
-            let plan = copy(&room.plans, step.plan, PLAN_BYTES);
+            let copy = |from, to, bytes| BufferCopy { from: (from, 0), to, bytes };
+            let plan = copy(&room.plans, (step.told, 0), PLAN_BYTES);
+            let pose_bytes = if poses { POSE_BYTES } else { 0 };
+            let pose = copy(&training.pose_sums, (step.told, PLAN_BYTES), pose_bytes);
             match earlier {
                 Some(earlier) if !moves => {
-                    stages.submit(&[plan, copy(&backward.gradients, earlier, gradient_bytes)])
+                    let gradients = copy(&backward.gradients, (earlier, 0), gradient_bytes);
+                    stages.submit(&[plan, pose, gradients])
                 }
                 _ => {
                     stages.gaussians(Kernel::Adam);
-                    stages.submit(&[plan])
+                    stages.submit(&[plan, pose])
                 }
             }
         })??;

@@ -6,13 +6,15 @@ use super::{
     Exposure, PhotoLoss, Trainer, TrainingPhoto, TrainingSet, TrainingStep, absent,
     adam::{Adam, checked},
     growth::{halves, most_blamed},
-    photo_loss, unit,
+    photo_loss,
+    pose::{Pose, PoseGradient},
+    unit,
 };
 use crate::{
     DifferentiableRenderer, Frame, RenderRequest,
     backward::{FrameGradients, Gradients},
     error::Result,
-    scene::Gaussians,
+    scene::{CameraToWorld, Gaussians},
 };
 
 /// A photo as the loss needs it.
@@ -24,12 +26,22 @@ struct Target {
     valid: Option<Vec<bool>>,
     exposure: Exposure,
     loss: f64,
+    /// Number of its camera.
+    pose: usize,
 }
 
 impl Target {
-    fn new(TrainingPhoto { photo, request }: &TrainingPhoto<'_>) -> Self {
-        let (request, valid) = (request.clone(), photo.valid.clone());
-        Self { request, rgb: unit(photo), valid, exposure: Exposure::default(), loss: f64::NAN }
+    fn new(TrainingPhoto { photo, request, pose }: &TrainingPhoto<'_>) -> Self {
+        let (request, valid, rgb) = (request.clone(), photo.valid.clone(), unit(photo));
+        let (exposure, pose) = (Exposure::default(), *pose);
+        Self { request, rgb, valid, exposure, loss: f64::NAN, pose }
+    }
+
+    /// Its view, where its camera stands now.
+    fn view(&self, poses: &[Pose]) -> RenderRequest {
+        let mut request = self.request.clone();
+        request.camera.camera_to_world = poses[self.pose].now;
+        request
     }
 
     /// What the loss says of a frame; the exposure moves.
@@ -67,6 +79,7 @@ pub struct HostTrainer<'a> {
     gaussians: Gaussians,
     adam: Adam,
     targets: Vec<Target>,
+    poses: Vec<Pose>,
     ssim_share: f32,
     gaussians_max: usize,
     /// Of a step, and of one of its photos.
@@ -85,6 +98,7 @@ impl<'a> HostTrainer<'a> {
             gaussians: set.gaussians.clone(),
             adam: Adam::new(set.gaussians),
             targets: set.photos.par_iter().map(Target::new).collect(),
+            poses: set.poses(),
             ssim_share: set.ssim_share,
             gaussians_max: set.gaussians_max,
             found: Default::default(),
@@ -94,13 +108,18 @@ impl<'a> HostTrainer<'a> {
 
 impl Trainer for HostTrainer<'_> {
     fn step(&mut self, photos: &[usize], step: &TrainingStep) -> Result<()> {
-        let Self { renderer, gaussians, adam, targets, ssim_share, found, .. } = self;
+        let Self { renderer, gaussians, adam, targets, poses, ssim_share, found, .. } = self;
         for (place, &at) in photos.iter().enumerate() {
             let target = targets.get_mut(at).ok_or_else(|| absent(at))?;
-            let request = target.request.clone();
+            let request = target.view(poses);
             let mut loss = |frame: &Frame| Ok(target.compare(frame, *ssim_share, step.exposure));
             let into = if place == 0 { &mut found.0 } else { &mut found.1 };
             renderer.backward(gaussians, &request, &mut loss, into)?;
+            if step.poses.moves() {
+                let pose = &mut poses[target.pose];
+                let by = PoseGradient::of(gaussians, into, pose.now.center());
+                pose.step(&by, step.poses);
+            }
             if place > 0 {
                 add(&mut found.0, &found.1);
             }
@@ -118,12 +137,12 @@ impl Trainer for HostTrainer<'_> {
         if more == 0 {
             return Ok(count);
         }
-        let Self { renderer, gaussians, targets, found: (found, _), .. } = self;
+        let Self { renderer, gaussians, targets, poses, found: (found, _), .. } = self;
         let mut blame = vec![0.0; count];
         for &at in photos {
             let target = targets.get(at).ok_or_else(|| absent(at))?;
             let mut loss = |frame: &Frame| Ok(target.differences(frame));
-            renderer.backward(gaussians, &target.request, &mut loss, found)?;
+            renderer.backward(gaussians, &target.view(poses), &mut loss, found)?;
             let by_colour = found.sh.par_chunks(k).with_min_len(1 << 12);
             blame.par_iter_mut().zip(by_colour).for_each(|(blame, by)| {
                 *blame += by[0].iter().sum::<f32>();
@@ -157,6 +176,10 @@ impl Trainer for HostTrainer<'_> {
 
     fn exposures(&mut self) -> Result<Vec<(Exposure, f64)>> {
         Ok(self.targets.iter().map(|target| (target.exposure, target.loss)).collect())
+    }
+
+    fn poses(&mut self) -> Result<Vec<CameraToWorld>> {
+        Ok(self.poses.iter().map(|pose| pose.now).collect())
     }
 }
 

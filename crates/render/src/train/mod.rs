@@ -5,24 +5,27 @@
 //! photos show ([`LearningRates`]). A [`Trainer`] is where that runs. [`HostTrainer`] does all but
 //! the drawing on the processor. The GPU renderer has one on the device (`shaders/photo_loss.wgsl`,
 //! `exposure.wgsl`, `adam.wgsl`): photos and Gaussians go up once, and only what is asked for comes
-//! back. An oracle in `tests/support` judges the loss.
+//! back. Where a step says so the camera of its photo moves too ([`pose`]). An oracle in
+//! `tests/support` judges the loss.
 
 pub mod adam;
 pub mod exposure;
 pub(crate) mod growth;
 mod host;
 pub mod photo_loss;
+pub mod pose;
 
 pub use self::{
     adam::{LearningRates, checked},
     exposure::Exposure,
     host::HostTrainer,
     photo_loss::{PhotoLoss, photo_loss},
+    pose::{PoseGradient, PoseRates},
 };
 use crate::{
     Frame, RenderRequest,
     error::{Error, Result},
-    scene::{Gaussians, Photo},
+    scene::{CameraToWorld, Gaussians, Photo},
 };
 
 /// A photo to learn from.
@@ -32,6 +35,9 @@ pub struct TrainingPhoto<'a> {
     pub photo: &'a Photo,
     /// The view of the scene that should look like it, of the same size.
     pub request: RenderRequest,
+    /// Number of its camera: copies of a photo share one, which stands where the first of them
+    /// says. Numbers begin at 0 and leave none out.
+    pub pose: usize,
 }
 
 /// What a [`Trainer`] begins with.
@@ -48,12 +54,28 @@ pub struct TrainingSet<'a> {
 }
 
 impl TrainingSet<'_> {
-    /// Refuses a photo of another size than its view.
+    /// The cameras of the photos.
+    pub(crate) fn poses(&self) -> Vec<pose::Pose> {
+        let mut poses = Vec::new();
+        for TrainingPhoto { request, pose, .. } in &self.photos {
+            if *pose == poses.len() {
+                poses.push(pose::Pose::new(request.camera.camera_to_world));
+            }
+        }
+        poses
+    }
+
+    /// Refuses a photo of another size than its view, and a number of a camera that leaves one out.
     ///
     /// # Errors
-    /// `internal`, with both sizes.
+    /// `internal`, with both.
     pub(crate) fn check(&self) -> Result<()> {
-        for TrainingPhoto { photo, request } in &self.photos {
+        let mut poses = 0;
+        for TrainingPhoto { photo, request, pose } in &self.photos {
+            if *pose > poses {
+                return Err(Error::internal(format!("training: camera {pose} after {poses}")));
+            }
+            poses = poses.max(pose + 1);
             let lens = request.lens();
             let (has, shown) = ([photo.width, photo.height], [lens.width, lens.height]);
             if has != shown {
@@ -73,6 +95,8 @@ pub struct TrainingStep {
     pub rates: LearningRates,
     /// How far gains and biases move.
     pub exposure: f32,
+    /// How far the cameras of the photos move.
+    pub poses: PoseRates,
     /// Gaussians under this opacity are dropped after the step; 0 drops none.
     pub opacity_min: f32,
 }
@@ -113,6 +137,12 @@ pub trait Trainer {
     /// # Errors
     /// As [`Self::step`].
     fn exposures(&mut self) -> Result<Vec<(Exposure, f64)>>;
+
+    /// Where the cameras stand, by their numbers.
+    ///
+    /// # Errors
+    /// As [`Self::step`].
+    fn poses(&mut self) -> Result<Vec<CameraToWorld>>;
 }
 
 /// A number of a photo.

@@ -11,7 +11,10 @@ use segsplat_core::{
 use segsplat_render::{
     DifferentiableRenderer, Frame, Kinds, RenderRequest, Renderer,
     backward::{FrameGradients, Gradients},
-    train::{HostTrainer, LearningRates, Trainer as _, TrainingPhoto, TrainingSet, TrainingStep},
+    train::{
+        HostTrainer, LearningRates, PoseRates, Trainer as _, TrainingPhoto, TrainingSet,
+        TrainingStep,
+    },
 };
 use segsplat_testing::scenes::{Random, camera, checked, push, request};
 
@@ -128,7 +131,7 @@ fn steps_are_those_of_pytorch() {
     let rgb = (0..8).flat_map(|at| [8 * at, 8 * at + 1, 8 * at + 2]).collect();
     let photo = Photo { width, height, rgb, valid: None };
     let request = RenderRequest { kinds: Kinds::COLOR, ..request(camera(width, height)) };
-    let photos = vec![TrainingPhoto { photo: &photo, request }];
+    let photos = vec![TrainingPhoto { photo: &photo, request, pose: 0 }];
     let given = Given::new();
     let set = TrainingSet { gaussians: &start, photos, ssim_share: 0.2, gaussians_max: 0 };
     let mut trainer = HostTrainer::new(&given, &set).expect("a trainer");
@@ -140,7 +143,8 @@ fn steps_are_those_of_pytorch() {
         sh: 2.5e-3,
         sh_rest: 1.25e-4,
     };
-    let step = TrainingStep { rates, exposure: 5e-3, opacity_min: 0.0 };
+    let step =
+        TrainingStep { rates, exposure: 5e-3, poses: PoseRates::default(), opacity_min: 0.0 };
     for _ in 0..STEPS {
         trainer.step(&[0], &step).expect("a step");
     }

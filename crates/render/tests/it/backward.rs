@@ -23,7 +23,7 @@ use crate::{
 };
 
 /// A loss that is linear in every number of the frame.
-fn linear(pixels: usize, seed: u64) -> FrameGradients {
+pub(crate) fn linear(pixels: usize, seed: u64) -> FrameGradients {
     let mut random = Random(seed);
     let mut number = || random.range(-1.0, 1.0);
     FrameGradients {
@@ -34,7 +34,7 @@ fn linear(pixels: usize, seed: u64) -> FrameGradients {
 }
 
 /// The same loss on some of the pixels.
-fn only(loss: &FrameGradients, keep: &[bool]) -> FrameGradients {
+pub(crate) fn only(loss: &FrameGradients, keep: &[bool]) -> FrameGradients {
     let mut loss = loss.clone();
     for (i, _) in keep.iter().enumerate().filter(|(_, keep)| !**keep) {
         loss.color.as_mut().unwrap()[i] = [0.0; 3];
@@ -45,7 +45,7 @@ fn only(loss: &FrameGradients, keep: &[bool]) -> FrameGradients {
 }
 
 /// Few Gaussians over a small picture: opaque ones, needles, some in front of many.
-fn few(random: &mut Random, sh_degree: u8) -> RawGaussians {
+pub(crate) fn few(random: &mut Random, sh_degree: u8) -> RawGaussians {
     let mut raw = RawGaussians { sh_degree, ..RawGaussians::default() };
     for i in 0..14 {
         let depth = random.range(2.0, 6.0);
@@ -103,7 +103,7 @@ fn derivative(of: &Gradients<f64>, kind: &str, at: usize) -> f64 {
 }
 
 /// The loss of each pixel, and which Gaussians make it, for a check that no cliff was crossed.
-fn losses(
+pub(crate) fn losses(
     gaussians: &Gaussians,
     request: &RenderRequest,
     loss: &FrameGradients,

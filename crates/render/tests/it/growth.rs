@@ -3,13 +3,17 @@
 use segsplat_core::scene::{Gaussians, Photo, RawGaussians, SourcePixel};
 use segsplat_render::{
     DifferentiableRenderer as _, RenderRequest, Renderer as _,
-    train::{HostTrainer, LearningRates, Trainer, TrainingPhoto, TrainingSet, TrainingStep},
+    train::{
+        HostTrainer, LearningRates, PoseRates, Trainer, TrainingPhoto, TrainingSet, TrainingStep,
+    },
 };
 use segsplat_testing::scenes::{camera, checked, cloud, push, request};
 
 use crate::common::{both_kernels, cpu};
 
-const STEP: TrainingStep = TrainingStep { rates: RATES, exposure: 5e-3, opacity_min: 0.0 };
+const STEP: TrainingStep =
+    TrainingStep { rates: RATES, exposure: 5e-3, poses: STILL, opacity_min: 0.0 };
+const STILL: PoseRates = PoseRates { turn: 0.0, shift: 0.0 };
 const RATES: LearningRates = LearningRates {
     means: 1e-3,
     quats: 1e-3,
@@ -37,6 +41,7 @@ fn set<'a>(
     let photo = |(request, photo): &'a (RenderRequest, Photo)| TrainingPhoto {
         photo,
         request: request.clone(),
+        pose: 0,
     };
     let photos = photos.iter().map(photo).collect();
     TrainingSet { gaussians, photos, ssim_share: 0.2, gaussians_max }

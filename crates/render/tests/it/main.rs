@@ -24,6 +24,7 @@ mod one_pass;
 mod oracle;
 mod pitfalls;
 mod pool;
+mod pose;
 mod props;
 mod reference;
 mod shader_layout;

@@ -251,7 +251,7 @@ fn every_stage_has_a_cpu_stage_and_every_file_is_used() {
             // The blend of a tile sorts it first.
             "tile_sort" => "cpu/rasterize",
             "depth_steps" => "levels",
-            "photo_loss" | "exposure" | "adam" => &format!("train/{stem}"),
+            "photo_loss" | "exposure" | "pose" | "adam" => &format!("train/{stem}"),
             stem if stem.ends_with("_backward") => "cpu/backward",
             stem => &format!("cpu/{stem}"),
         };

@@ -9,8 +9,8 @@ use segsplat_render::{
     Background, DifferentiableRenderer, Kinds, RenderRequest, Renderer as _,
     gpu::GpuRenderer,
     train::{
-        HostTrainer, LearningRates, Trainer, TrainingPhoto, TrainingSet, TrainingStep, photo_loss,
-        unit,
+        HostTrainer, LearningRates, PoseRates, Trainer, TrainingPhoto, TrainingSet, TrainingStep,
+        photo_loss, unit,
     },
 };
 use segsplat_testing::{
@@ -102,7 +102,7 @@ fn pixels_without_a_source_and_small_pictures_are_allowed_for() {
 }
 
 /// Views of `truth` and photos that they should look like, some darker, some with holes.
-fn photos(truth: &Gaussians, sides: &[[u32; 2]]) -> Vec<(RenderRequest, Photo)> {
+pub(crate) fn photos(truth: &Gaussians, sides: &[[u32; 2]]) -> Vec<(RenderRequest, Photo)> {
     let make = |(i, &[width, height]): (usize, &[u32; 2])| {
         let eye = glam::DVec3::new(0.3 * i as f64 - 0.5, 0.2 * i as f64, -0.5);
         let pose = look(eye, glam::DVec3::new(0.3, -0.2, 4.0));
@@ -120,7 +120,7 @@ fn photos(truth: &Gaussians, sides: &[[u32; 2]]) -> Vec<(RenderRequest, Photo)> 
     sides.iter().enumerate().map(make).collect()
 }
 
-fn disturbed(gaussians: &Gaussians) -> Gaussians {
+pub(crate) fn disturbed(gaussians: &Gaussians) -> Gaussians {
     let mut random = Random(8);
     let mut raw = gaussians.clone().into_raw();
     for i in 0..raw.means.len() {
@@ -133,17 +133,23 @@ fn disturbed(gaussians: &Gaussians) -> Gaussians {
     checked(raw)
 }
 
-fn set<'a>(gaussians: &'a Gaussians, photos: &'a [(RenderRequest, Photo)]) -> TrainingSet<'a> {
+pub(crate) fn set<'a>(
+    gaussians: &'a Gaussians,
+    photos: &'a [(RenderRequest, Photo)],
+) -> TrainingSet<'a> {
     let photo = |(request, photo): &'a (RenderRequest, Photo)| TrainingPhoto {
         photo,
         request: request.clone(),
+        pose: 0,
     };
-    let photos = photos.iter().map(photo).collect();
+    let photos = photos.iter().map(photo).enumerate();
+    let photos = photos.map(|(pose, photo)| TrainingPhoto { pose, ..photo }).collect();
     TrainingSet { gaussians, photos, ssim_share: SHARE, gaussians_max: gaussians.len() }
 }
 
-fn step(opacity_min: f32) -> TrainingStep {
-    TrainingStep { rates: LearningRates::default(), exposure: 5e-3, opacity_min }
+pub(crate) fn step(opacity_min: f32) -> TrainingStep {
+    let (rates, poses) = (LearningRates::default(), PoseRates::default());
+    TrainingStep { rates, exposure: 5e-3, poses, opacity_min }
 }
 
 #[test]

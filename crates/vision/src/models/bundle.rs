@@ -19,7 +19,7 @@ use crate::{
         NetworkOptions, SETUP_COMMAND,
         manifest::{
             Faults, FeaturesManifest, GeometryManifest, ImageTextManifest, MANIFEST, MasksManifest,
-            is_plain, unavailable,
+            TextMasksManifest, is_plain, unavailable,
         },
         onnx::OnnxHeader,
         places,
@@ -56,6 +56,7 @@ struct BundleManifest {
     geometry: GeometryManifest,
     masks: Option<MasksManifest>,
     image_text: Option<ImageTextManifest>,
+    text_masks: Option<TextMasksManifest>,
     features: Option<FeaturesManifest>,
 }
 
@@ -67,8 +68,8 @@ type Data<'a> = [&'a Option<String>; 2];
 pub struct BundleFile<'a> {
     /// What it is for: `geometry`, `geometry.cpu`, `geometry.many`, `geometry.many.cpu`,
     /// `masks.encoder`, `masks.decoder`, `image_text.image`, `image_text.text`,
-    /// `image_text.tokenizer`, `image_text.words`, `features`. A file of weights beside
-    /// another has that one's name.
+    /// `image_text.tokenizer`, `image_text.words`, `text_masks.image`, `text_masks.find`,
+    /// `text_masks.tokenizer`, `features`. A file of weights beside another has that one's name.
     pub part: &'static str,
     /// Name in the bundle's folder.
     pub file: &'a str,
@@ -149,6 +150,9 @@ impl Bundle {
         }
         if let Some(image_text) = &manifest.image_text {
             image_text.validate(&mut faults);
+        }
+        if let Some(text_masks) = &manifest.text_masks {
+            text_masks.validate(&mut faults);
         }
         if let Some(features) = &manifest.features {
             features.validate(&mut faults);
@@ -248,6 +252,12 @@ impl Bundle {
         self.manifest.image_text.as_ref()
     }
 
+    /// The entry of the network that masks what a text says; `None`: texts are compared with masks.
+    #[must_use]
+    pub fn text_masks(&self) -> Option<&TextMasksManifest> {
+        self.manifest.text_masks.as_ref()
+    }
+
     /// The feature network's entry; `None`: it takes no photos without cameras.
     #[must_use]
     pub fn features(&self) -> Option<&FeaturesManifest> {
@@ -268,7 +278,8 @@ impl Bundle {
     /// Every file that the manifest names, itself left out.
     #[must_use]
     pub fn files<'a>(&'a self) -> Vec<BundleFile<'a>> {
-        let BundleManifest { geometry, masks, image_text, features, .. } = &self.manifest;
+        let BundleManifest { geometry, masks, image_text, text_masks, features, .. } =
+            &self.manifest;
         let mut files = Vec::new();
         let mut network = |part, licence, [file, sha256]: [&'a str; 2], data: Data<'a>| {
             files.push(BundleFile { part, file, sha256, licence });
@@ -301,6 +312,12 @@ impl Bundle {
             if let Some(words) = &image_text.words {
                 network("image_text.words", licence, [&words.file, &words.sha256], [&None, &None]);
             }
+        }
+        if let Some(TextMasksManifest { image: i, find: f, licence, .. }) = text_masks {
+            network("text_masks.image", licence, [&i.file, &i.sha256], [&i.data, &i.data_sha256]);
+            network("text_masks.find", licence, [&f.file, &f.sha256], [&f.data, &f.data_sha256]);
+            let tokenizer = [&*f.tokenizer, &f.tokenizer_sha256];
+            network("text_masks.tokenizer", licence, tokenizer, [&None, &None]);
         }
         if let Some(f) = features {
             network("features", &f.licence, [&f.file, &f.sha256], [&f.data, &f.data_sha256]);

@@ -7,8 +7,9 @@ use crate::{
     error::Result,
     models::{
         Bundle, FeatureNetwork, Geometry, ImageText, MaskNetwork, NetworkOptions, ProviderChoice,
-        Runtime, features, geometry, image_text, masks,
+        Runtime, TextMaskNetwork, features, geometry, image_text, masks,
         network::{self, Signature},
+        text_masks,
     },
 };
 
@@ -101,6 +102,14 @@ pub fn check(dir: &Path, options: &NetworkOptions) -> Result<BundleCheck> {
                 timed(
                     || ImageText::open(runtime, &bundle, options),
                     |of| of.as_ref().map_or(Ok(()), ImageText::try_out),
+                )
+            });
+        }
+        if let Some(manifest) = bundle.text_masks() {
+            run("text_masks", &text_masks::signatures(manifest), &|| {
+                timed(
+                    || TextMaskNetwork::open(runtime, &bundle, options),
+                    |of| of.as_ref().map_or(Ok(()), TextMaskNetwork::try_out),
                 )
             });
         }

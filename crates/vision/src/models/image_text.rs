@@ -349,15 +349,7 @@ impl ImageText {
         if unknown == 0 {
             unknown = self.in_short_pieces(text, &encoding);
         }
-        let whole = encoding.get_ids();
-        let cut = whole.len() > context;
-        let mut ids: Vec<i64> = whole.iter().take(context).map(|&id| i64::from(id)).collect();
-        // The end marker stays at the end of a text that is cut: towers read the sentence there.
-        if let (true, Some(1), Some(last), Some(end)) =
-            (cut, special.last(), ids.last_mut(), whole.last())
-        {
-            *last = i64::from(*end);
-        }
+        let (ids, cut) = (cut_ids(&encoding, context), encoding.get_ids().len() > context);
         Ok(Tokens { ids, count, unknown, cut })
     }
 
@@ -449,6 +441,22 @@ impl ImageText {
     }
 }
 
+/// At most `context` ids of a text. The end marker stays at the end of one that is cut: networks
+/// read the sentence there.
+pub(super) fn cut_ids(encoding: &Encoding, context: usize) -> Vec<i64> {
+    let whole = encoding.get_ids();
+    let mut ids: Vec<i64> = whole.iter().take(context).map(|&id| i64::from(id)).collect();
+    if let (true, Some(1), Some(last), Some(end)) = (
+        whole.len() > context,
+        encoding.get_special_tokens_mask().last(),
+        ids.last_mut(),
+        whole.last(),
+    ) {
+        *last = i64::from(*end);
+    }
+    ids
+}
+
 /// Each file with its tensors.
 pub(super) fn signatures(manifest: &ImageTextManifest) -> Vec<Signature<'_>> {
     let (image, text) = (&manifest.image, &manifest.text);
@@ -490,7 +498,7 @@ fn text_signature(manifest: &ImageTextManifest, ids: usize) -> Vec<Wanted<'_>> {
 }
 
 /// A dimension of an input, where the file fixes it.
-fn size(takes: &FileSignature, input: &str, axis: usize) -> Option<usize> {
+pub(super) fn size(takes: &FileSignature, input: &str, axis: usize) -> Option<usize> {
     takes.get(input)?.shape.get(axis).copied().and_then(fixed)
 }
 
@@ -507,8 +515,8 @@ fn yes() -> bool {
     true
 }
 
-/// The tokenizer's file, whose own truncation and padding are switched off: both are done here.
-fn read_tokenizer(bundle: &Bundle, named: &str) -> Result<Tokenizer> {
+/// The tokenizer's file, whose own truncation is switched off: it is done here.
+pub(super) fn read_tokenizer(bundle: &Bundle, named: &str) -> Result<Tokenizer> {
     let refused = |why: String| unavailable(format!("{named}: {why}"));
     let bytes = fs_err::read(bundle.path(named)).map_err(|e| refused(e.kind().to_string()))?;
     let mut tokenizer = Tokenizer::from_bytes(&bytes).map_err(|e| refused(e.to_string()))?;

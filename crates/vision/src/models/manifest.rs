@@ -1,6 +1,7 @@
 //! The sections of `bundle.toml`: the geometry network, the mask network, the image and text
-//! towers, the feature network. `models/README.md` lists every key. A bundle without the second and
-//! third has no semantics; one without the last takes no photos without cameras.
+//! towers, the network that masks what a text says, the feature network. `models/README.md` lists
+//! every key. A bundle without the second and third has no semantics; one without the last takes no
+//! photos without cameras.
 
 use std::{
     fmt::{Debug, Display},
@@ -559,6 +560,101 @@ pub struct TextTowerManifest {
     pub output: String,
 }
 
+/// The network that masks what a text says in `bundle.toml`: a photo is encoded once, and each text
+/// is looked for in what came of that.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TextMasksManifest {
+    /// Licence of the weights.
+    pub licence: String,
+    /// Where the weights come from.
+    pub source: String,
+    /// Side in pixels of the square that a photo is stretched to.
+    pub size: u32,
+    /// Subtracted from the 0..1 channels.
+    pub mean: [f32; 3],
+    /// Divides them after that.
+    pub std: [f32; 3],
+    /// Filter that brings a photo into the square.
+    #[serde(default)]
+    pub resize: ResizeFilter,
+    /// Least score of a mask, 0.5 to 1.
+    #[serde(default = "defaults::threshold")]
+    pub threshold: f32,
+    /// Most by which a device may differ from the CPU, root of mean squares, share of the answer.
+    #[serde(default = "defaults::tolerance")]
+    pub tolerance: f64,
+    /// What encodes a photo.
+    pub image: TextMasksImageManifest,
+    /// What finds a text in it.
+    pub find: TextMasksFindManifest,
+}
+
+/// The image encoder of a network that masks what a text says.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TextMasksImageManifest {
+    /// File in the bundle's folder.
+    pub file: String,
+    /// Its sha256, hex.
+    pub sha256: String,
+    /// File of the weights that are not in `file`.
+    pub data: Option<String>,
+    /// Its sha256, hex.
+    pub data_sha256: Option<String>,
+    /// Input: `[1, 3, size, size]` f32.
+    pub input: String,
+    /// Outputs, which the other file takes under the same names.
+    pub features: Vec<String>,
+}
+
+/// What finds a text in an encoded photo.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TextMasksFindManifest {
+    /// File in the bundle's folder.
+    pub file: String,
+    /// Its sha256, hex.
+    pub sha256: String,
+    /// File of the weights that are not in `file`.
+    pub data: Option<String>,
+    /// Its sha256, hex.
+    pub data_sha256: Option<String>,
+    /// Tokenizer file in the bundle's folder.
+    pub tokenizer: String,
+    /// Its sha256, hex.
+    pub tokenizer_sha256: String,
+    /// Most tokens of a text; a longer one is cut.
+    pub context: usize,
+    /// Input: `[1, T]` i64.
+    pub input_ids: String,
+    /// Input: `[1, T]` i64, 1 for a token and 0 for padding; absent where the network has none.
+    pub attention_mask: Option<String>,
+    /// Output: `[1, Q, h, w]` f32, logits over the whole photo; over 0 is inside.
+    pub masks: String,
+    /// Output: `[1, Q]` f32, 0..1: how sure it is that the mask is what the text says.
+    pub scores: String,
+}
+
+impl TextMasksManifest {
+    pub(super) fn validate(&self, faults: &mut Faults) {
+        let Self { image, find, .. } = self;
+        faults.file("text_masks.image", &image.file, &image.sha256);
+        faults.data("text_masks.image", &image.data, &image.data_sha256);
+        faults.file("text_masks.find", &find.file, &find.sha256);
+        faults.data("text_masks.find", &find.data, &find.data_sha256);
+        faults.file("text_masks.find.tokenizer", &find.tokenizer, &find.tokenizer_sha256);
+        faults.range("text_masks.size", self.size, 1..=BUCKET_SIDE_MAX);
+        faults.channels("text_masks", self.mean, self.std);
+        faults.range("text_masks.threshold", self.threshold, 0.5..=1.0);
+        faults.range("text_masks.tolerance", self.tolerance, 0.0..=TOLERANCE_MAX);
+        faults.range("text_masks.find.context", find.context, 1..=CONTEXT_MAX);
+        if image.features.is_empty() {
+            faults.wrong("text_masks.image.features", &image.features, "hold 1 or more names");
+        }
+    }
+}
+
 /// The feature network in `bundle.toml`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -656,6 +752,7 @@ mod defaults {
         rivals: f32 = 1.0_f32;
         batch: usize = 16_usize;
         tolerance: f64 = 2e-3;
+        threshold: f32 = 0.5_f32;
         image_embeddings: String = "image_embeddings";
         point_coords: String = "point_coords";
         point_labels: String = "point_labels";

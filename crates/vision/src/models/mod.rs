@@ -2,9 +2,9 @@
 //!
 //! [`Geometry`]: photos with cameras, depth ranges and neighbours to [`ViewGaussians`].
 //! [`MaskNetwork`]: a photo and points in it to masks. [`ImageText`]: crops and texts to embeddings
-//! of one space. [`FeatureNetwork`]: a photo to keypoints and descriptors. A network is known only
-//! by its `bundle.toml`: names, sizes, normalisation and frames all come from there. The only
-//! module that knows `ort`.
+//! of one space. [`TextMaskNetwork`]: a photo and a text to masks. [`FeatureNetwork`]: a photo to
+//! keypoints and descriptors. A network is known only by its `bundle.toml`: names, sizes,
+//! normalisation and frames all come from there. The only module that knows `ort`.
 //!
 //! [`ViewGaussians`]: crate::scene::ViewGaussians
 
@@ -25,6 +25,7 @@ mod places;
 mod resize;
 mod runtime;
 mod tensors;
+mod text_masks;
 
 pub use bundle::{Bundle, BundleFile};
 pub use check::{BundleCheck, CheckedFile, check};
@@ -36,7 +37,8 @@ pub use image_text::{ImageText, PreparedCrops};
 pub use manifest::{
     DenseManifest, FeaturesManifest, GeometryManifest, GeometryWeights, ImageTextManifest,
     ImageTowerManifest, MaskAdapter, MaskDecoderManifest, MaskEncoderManifest, MasksManifest,
-    OutputFrame, PlainFile, TextTowerManifest, Translation,
+    OutputFrame, PlainFile, TextMasksFindManifest, TextMasksImageManifest, TextMasksManifest,
+    TextTowerManifest, Translation,
 };
 pub use masks::{MaskNetwork, PhotoEmbedding};
 pub use network::Network;
@@ -44,3 +46,4 @@ pub use options::{NetworkOptions, ProviderChoice, SETUP_COMMAND};
 pub use resize::ResizeFilter;
 pub use runtime::{Provider, Runtime};
 pub use tensors::{NetworkTensors, Tensor, TensorData, TensorKind, TensorSpec};
+pub use text_masks::{EncodedPhoto, TextMaskNetwork};

@@ -8,7 +8,7 @@ use std::{sync::Arc, time::Instant};
 use rayon::prelude::*;
 use segsplat_cameras::{
     CONFIDENCE_MIN, Evidence, PairMatches, PhotoKeypoints, Placed, Placing, Solution, SolveOptions,
-    pairs_to_match, solve,
+    mend, pairs_to_match, solve,
 };
 
 use super::{
@@ -25,8 +25,9 @@ use crate::{
     models::FeatureNetwork,
     photos,
     scene::{
-        Camera, CamerasReport, CamerasSource, LeftOutPhoto, PlacedPhoto, PosedPhoto, SolvedCamera,
-        Stage, StageTime, UnposedPhoto, Warning, WarningCode, Watch, unless_cancelled,
+        Camera, CameraToWorld, CamerasReport, CamerasSource, LeftOutPhoto, Photo, PlacedPhoto,
+        PosedPhoto, SolvedCamera, Stage, StageTime, UnposedPhoto, Warning, WarningCode, Watch,
+        unless_cancelled,
     },
 };
 
@@ -117,20 +118,60 @@ pub fn judged(
     Ok(JudgedCameras { confidence, evidence, placings, refused })
 }
 
+/// Where the cameras of photos stand by their keypoints; `None` where these are too few, or the
+/// bundle has no network that finds them.
+///
+/// # Errors
+/// `cancelled`, `internal`; `model_unavailable` where the network does not open.
+pub fn mended(
+    pipeline: &Pipeline,
+    photos: &[PosedPhoto],
+    watch: Watch<'_>,
+) -> Result<Option<Vec<CameraToWorld>>> {
+    if pipeline.bundle.features().is_none() {
+        return Ok(None);
+    }
+    let pixels: Vec<(&Photo, Option<f64>)> =
+        photos.iter().map(|posed| (&posed.photo, None)).collect();
+    let (keypoints, matches) = matched(pipeline, &pixels, watch)?;
+    let cameras: Vec<Camera> = photos.iter().map(|posed| posed.camera).collect();
+    pipeline.workers.install(|| mend(&cameras, &keypoints, &matches))
+}
+
 /// The solver's answer.
 fn solved(pipeline: &Pipeline, photos: &[UnposedPhoto], watch: Watch<'_>) -> Result<Solution> {
     let Watch { progress, cancel } = watch;
     let tell = |fraction: f32| progress(Stage::Cameras, fraction);
+    let pixels: Vec<(&Photo, Option<f64>)> =
+        photos.iter().map(|unposed| (&unposed.photo, unposed.focal)).collect();
+    let (keypoints, matches) = matched(pipeline, &pixels, watch)?;
+    let options = SolveOptions {
+        photos_max: photos.len(),
+        keypoints_max: pipeline.features()?.manifest().count,
+        ..SolveOptions::default()
+    };
+    let share = |done: f64| tell(MATCHES_END + (SOLVED_END - MATCHES_END) * done as f32);
+    pipeline.workers.install(|| solve(&keypoints, &matches, &options, cancel, &share))
+}
+
+/// Keypoints of photos, each with its focal length where that is known, and their matches.
+fn matched(
+    pipeline: &Pipeline,
+    photos: &[(&Photo, Option<f64>)],
+    watch: Watch<'_>,
+) -> Result<(Vec<PhotoKeypoints>, Vec<PairMatches>)> {
+    let Watch { progress, cancel } = watch;
+    let tell = |fraction: f32| progress(Stage::Cameras, fraction);
     let network = pipeline.features()?;
     let (mut keypoints, mut descriptors) = (Vec::new(), Vec::new());
-    for (done, unposed) in photos.iter().enumerate() {
+    for (done, (photo, focal)) in photos.iter().enumerate() {
         unless_cancelled(cancel)?;
         tell(KEYPOINTS_END * fraction(done, photos.len()));
-        let found = pipeline.workers.install(|| network.find(&unposed.photo))?;
+        let found = pipeline.workers.install(|| network.find(photo))?;
         descriptors.push(Descriptors::new(&found.descriptors, found.dim));
         keypoints.push(PhotoKeypoints {
-            size: [unposed.photo.width, unposed.photo.height],
-            focal: unposed.focal,
+            size: [photo.width, photo.height],
+            focal: *focal,
             keypoints: found.keypoints,
             seconds: None,
         });
@@ -149,15 +190,8 @@ fn solved(pipeline: &Pipeline, photos: &[UnposedPhoto], watch: Watch<'_>) -> Res
     let matches = pipeline
         .workers
         .install(|| pairs.par_iter().map(matched).collect::<Result<Vec<PairMatches>>>())?;
-    drop(descriptors);
     tell(MATCHES_END);
-    let options = SolveOptions {
-        photos_max: photos.len(),
-        keypoints_max: network.manifest().count,
-        ..SolveOptions::default()
-    };
-    let share = |done: f64| tell(MATCHES_END + (SOLVED_END - MATCHES_END) * done as f32);
-    pipeline.workers.install(|| solve(&keypoints, &matches, &options, cancel, &share))
+    Ok((keypoints, matches))
 }
 
 /// Photos whose cameras stand the judgement.

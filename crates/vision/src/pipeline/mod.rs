@@ -12,6 +12,7 @@ mod networks;
 pub mod refinement;
 pub mod semantics;
 mod sets;
+pub mod words;
 
 pub use self::{
     loader::PipelineLoader,
@@ -94,6 +95,9 @@ impl Pipeline {
         {
             pipeline.masks()?;
             pipeline.image_text()?;
+            if pipeline.bundle.text_masks().is_some() {
+                pipeline.text_masks()?;
+            }
         }
         Ok(pipeline)
     }
@@ -282,6 +286,26 @@ pub fn make_keeping(
     let seen = see(pipeline, &photos.photos, options, watch)?;
     let made = united(pipeline, &photos.photos, seen.clone(), watch)?;
     Ok((with_reading(made, photos), seen))
+}
+
+/// The photos where their keypoints say that their cameras stand ([`cameras::mended`]), and what the
+/// network says of them there; `None` where keypoints do not tell.
+///
+/// # Errors
+/// As [`reconstruct`].
+pub fn recast(
+    pipeline: &Pipeline,
+    photos: &[PosedPhoto],
+    options: &SceneOptions,
+    watch: Watch<'_>,
+) -> Result<Option<(Vec<PosedPhoto>, Seen)>> {
+    let Some(poses) = cameras::mended(pipeline, photos, watch)? else { return Ok(None) };
+    let mut photos = photos.to_vec();
+    for (posed, pose) in photos.iter_mut().zip(poses) {
+        posed.camera.camera_to_world = pose;
+    }
+    let seen = see(pipeline, &photos, options, watch)?;
+    Ok(Some((photos, seen)))
 }
 
 /// The scene of `photos` less those of the numbers `held`, and the same as one set that agrees

@@ -6,7 +6,7 @@ use parking_lot::Mutex;
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    models::{FeatureNetwork, ImageText, MaskNetwork, NetworkOptions},
+    models::{FeatureNetwork, ImageText, MaskNetwork, NetworkOptions, TextMaskNetwork},
 };
 
 /// The networks that not every scene needs, opened at the first use and kept.
@@ -15,21 +15,24 @@ pub(super) struct LazyNetworks {
     pub(super) options: NetworkOptions,
     pub(super) masks: Mutex<Option<Arc<MaskNetwork>>>,
     pub(super) image_text: Mutex<Option<Arc<ImageText>>>,
+    pub(super) text_masks: Mutex<Option<Arc<TextMaskNetwork>>>,
     pub(super) features: Mutex<Option<Arc<FeatureNetwork>>>,
 }
 
 impl LazyNetworks {
     pub(super) fn new(options: &NetworkOptions) -> Self {
         let options = options.clone();
-        let (masks, image_text, features) = Default::default();
-        Self { options, masks, image_text, features }
+        let (masks, image_text, text_masks, features) = Default::default();
+        Self { options, masks, image_text, text_masks, features }
     }
 
     /// Why an open network is not computed where it was to be; one that is being opened says
     /// nothing yet.
     pub(super) fn remark(&self) -> Option<String> {
         let masks = || self.masks.try_lock()?.as_ref()?.remark();
-        masks().or_else(|| self.image_text.try_lock()?.as_ref()?.remark())
+        masks()
+            .or_else(|| self.image_text.try_lock()?.as_ref()?.remark())
+            .or_else(|| self.text_masks.try_lock()?.as_ref()?.remark())
     }
 }
 

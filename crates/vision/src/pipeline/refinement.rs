@@ -6,9 +6,10 @@
 use std::{
     sync::mpsc::{RecvTimeoutError, channel},
     thread,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
+use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 use segsplat_render::{DifferentiableRenderer, Kinds, RenderRequest, plan::default_near};
 
@@ -17,12 +18,13 @@ use crate::{
     error::Result,
     models::{ResizeFilter, fit},
     refine::{
-        self, Judged, RefineBudget, RefineOptions, RefinedVersion, Stepped, UNWATCHED_STEPS_MAX,
-        fewer, held_out, judged_as_served, mean_difference, ready, split,
+        self, ALIGNING_STEPS, Judged, RefineBudget, RefineOptions, RefinedVersion, Stepped,
+        UNWATCHED_STEPS_MAX, aligned, carried, covered, differences, extent, fewer, held_out,
+        judged_as_plain, judged_as_served, ready, unexplained,
     },
     scene::{
-        Camera, Gaussians, HealthReport, Method, Photo, PosedPhoto, RefineReport, Scene,
-        SceneCamera, SceneMeta, Semantics,
+        Camera, CameraToWorld, CameraUse, Gaussians, HealthReport, Method, MovedCamera, Photo,
+        PosedPhoto, RefineReport, Scene, SceneCamera, SceneMeta, Semantics,
     },
     semantics::{Views, from_source},
 };
@@ -38,6 +40,14 @@ const PROCESSOR_COARSE_SIDE: u32 = 240;
 /// About what a Gaussian of degree 0 takes on a device, with moments, gradients and tile pairs.
 const DEVICE_BYTES_A_GAUSSIAN: u64 = 600;
 
+/// Times that each camera is brought to where the others say, before all are learnt.
+const SETTLING_ROUNDS: usize = 2;
+
+/// Photos of which the first proof leaves more than this share unexplained, and so many times as
+/// much as of the one in the middle, are left out: their cameras cannot be right (docs/adr/0078).
+const LEFT_OUT_FROM: f64 = 0.75;
+const LEFT_OUT_FACTOR: f64 = 2.0;
+
 /// The work on a version makes all that was done this many times as long.
 const LONGER: u32 = 4;
 
@@ -50,6 +60,9 @@ pub struct Refined {
     /// much they differ from the learnt ones beside them; `None` where there was no proof, or
     /// nothing better.
     pub overfit: Option<f64>,
+    /// What the held-out photos gained by cameras that fit the first proof ([`Judged::score`]);
+    /// `None` where that was not asked.
+    pub pose_gain: Option<f64>,
     /// Versions that were published.
     pub versions: u32,
 }
@@ -62,6 +75,9 @@ pub type Remake<'a> = &'a mut dyn FnMut(&[usize]) -> Result<(Reconstruction, Gau
 pub struct RefineCalls<'a> {
     /// The scene without some photos, and the same as one set. The last call is that of all photos.
     pub remake: Remake<'a>,
+    /// Finds where the cameras stand by other means than steps, and has the networks run with them:
+    /// what `remake` gives from then on is of these. `None`: nothing is found, and nothing changes.
+    pub recast: &'a mut dyn FnMut() -> Result<Option<Vec<CameraToWorld>>>,
     /// Gets the share of the budget that is spent, 0..1, before each step, and may wait.
     pub pace: &'a mut dyn FnMut(f32) -> Result<()>,
     /// Gets each version that is better than the one before, with the scene that it began with.
@@ -83,6 +99,11 @@ pub struct RefineCalls<'a> {
 /// ([`RefineOptions::overfit_max`]); else it begins with those of the networks (docs/adr/0041). Of
 /// too few photos none is held out, and few steps are taken.
 ///
+/// **Cameras.** The first proof also says whether cameras are wrong: where the held-out photos gain
+/// [`RefineOptions::mends_from`] by cameras that fit the scene of the others, cameras are learnt
+/// from then on, and held-out photos are judged where their cameras fit, before as after.
+///
+///
 /// # Errors
 /// Those of `calls` and of [`refine::refine`].
 pub fn refined(
@@ -94,9 +115,25 @@ pub fn refined(
 ) -> Result<Refined> {
     let held = held_out(photos.len());
     let options = fitted(options, photos, renderer.is_device());
+    let pose_rate = match scene.meta.report.method.camera {
+        CameraUse::Given => 0.0,
+        CameraUse::Mended => options.pose_rate,
+    };
+    let options = RefineOptions { pose_rate, ..options };
     let sized = photos.par_iter().map(|photo| at_side(photo, options.side)).collect();
-    let done = Work::default();
-    let mut parts = Parts { renderer, scene, photos: sized, options, calls, done };
+    let given: Vec<CameraToWorld> = photos.iter().map(pose_of).collect();
+    let mut parts = Parts {
+        renderer,
+        scene,
+        photos: sized,
+        made: given.clone(),
+        given,
+        mends: false,
+        left_out: Vec::new(),
+        options,
+        calls,
+        done: Work::default(),
+    };
     if held.is_empty() { parts.unwatched() } else { parts.watched(&held) }
 }
 
@@ -111,8 +148,16 @@ struct Work {
 struct Parts<'a, 'c> {
     renderer: &'a dyn DifferentiableRenderer,
     scene: &'a Scene,
-    /// At the size at which they are learnt.
+    /// At the size at which they are learnt, with their cameras as they stand now.
     photos: Vec<PosedPhoto>,
+    /// Where their cameras stood.
+    given: Vec<CameraToWorld>,
+    /// Where those stood that the Gaussians of the networks were made with.
+    made: Vec<CameraToWorld>,
+    /// Whether cameras are learnt.
+    mends: bool,
+    /// Photos whose cameras cannot be right.
+    left_out: Vec<usize>,
     options: RefineOptions,
     calls: RefineCalls<'c>,
     /// All that was done so far.
@@ -127,22 +172,22 @@ impl Parts<'_, '_> {
         let budget = RefineBudget { steps, ..self.options.budget };
         let options = RefineOptions { budget, ..self.options };
         let made = self.work(&start, &gaussians, &[], &options)?;
-        let report = self.report_of(&made, made.steps, [None; 2]);
-        let version = RefinedVersion { gaussians: made.gaussians, report: report.clone() };
+        let report = self.report_of(&start, &made, made.steps, [None; 2]);
+        let (gaussians, poses) = (made.gaussians, self.poses());
+        let version = RefinedVersion { gaussians, report: report.clone(), poses };
         (self.calls.publish)(&start, &version)?;
-        Ok(Refined { report, overfit: None, versions: 1 })
+        Ok(Refined { report, overfit: None, pose_gain: None, versions: 1 })
     }
 
     /// Photos of which those of the numbers `held` say how good versions are.
     fn watched(&mut self, held: &[usize]) -> Result<Refined> {
-        let (proof_start, mut proof) = self.begin(held)?;
-        let held_photos = split(&self.photos, held).1;
-        let before = judged_as_served(self.renderer, &proof_start, &held_photos)?;
-        let before = before.map(|before| before.psnr);
+        let (mut proof_start, mut first) = self.begin(held)?;
+        let mut proof = first.clone();
+        let mut before = self.judged_before(held, &proof_start)?;
         let earlier = self.scene.meta.report.refinement.as_ref().and_then(|it| it.psnr_after);
-        let least = if earlier > before { earlier } else { before };
         let mut last: Option<Judged> = None;
-        let mut found = Refined { report: self.as_before(before), overfit: None, versions: 0 };
+        let report = self.as_before(before);
+        let mut found = Refined { report, overfit: None, pose_gain: None, versions: 0 };
         // Of all photos: what it began with, how it is now, and how many steps it had.
         let mut whole: Option<(Scene, Gaussians, u32)> = None;
         while let Some(part) = self.next_part(whole.is_some()) {
@@ -156,10 +201,37 @@ impl Parts<'_, '_> {
             let proven = self.work(&proof_start, &proof, held, &proof_options)?;
             proof = proven.gaussians;
             tracing::debug!(steps = proven.steps, judged = ?proven.judged, "proven");
-            let psnr = proven.judged.map(|judged| judged.psnr);
-            let gains = match (last, proven.judged) {
+            let mut judged = proven.judged;
+            if is_first && self.options.pose_rate > 0.0 || self.mends {
+                let (fitting, gain) = self.fit_held_out(held, &proof_start, &proof, judged)?;
+                judged = fitting;
+                found.pose_gain = found.pose_gain.or(gain);
+            }
+            if is_first && self.leave_out(&proof_start, &proof)? {
+                proof = proof.only(|i| !self.is_left_out(&proof, i));
+                first = first.only(|i| !self.is_left_out(&first, i));
+                let held_photos = self.parted(held).1;
+                judged = judged_as_plain(self.renderer, &proof_start, &proof, &held_photos)?;
+            }
+            if is_first && self.mends {
+                if let Some(poses) = (self.calls.recast)()? {
+                    self.stand_all(&poses);
+                    self.made.clone_from(&poses);
+                    (proof_start, first) = self.begin(held)?;
+                    first = first.only(|i| !self.is_left_out(&first, i));
+                }
+                let settled = self.settle_cameras(held, &proof_start, &first)?;
+                proof = self.work(&proof_start, &settled, held, &proof_options)?.gaussians;
+                judged = self.fit_held_out(held, &proof_start, &proof, None)?.0;
+            }
+            if is_first && (self.mends || !self.left_out.is_empty()) {
+                before = self.judged_before_fitting(held, &proof_start, &first)?;
+                found.report = self.as_before(before);
+            }
+            let psnr = judged.map(|judged| judged.psnr);
+            let gains = match (last, judged) {
                 (Some(last), Some(now)) => now.score() > last.score() + self.options.gain_min,
-                _ => psnr > least,
+                _ => psnr > if earlier > before { earlier } else { before },
             };
             if !gains {
                 // Too few steps may not have been enough; more that gain nothing are too many.
@@ -168,7 +240,7 @@ impl Parts<'_, '_> {
                 }
                 continue;
             }
-            last = proven.judged;
+            last = judged;
             let (start, gaussians, steps) = match whole.take() {
                 Some(whole) => whole,
                 None => {
@@ -180,16 +252,220 @@ impl Parts<'_, '_> {
             };
             let budget = self.rest_of(part, proven.time);
             let options = RefineOptions { budget, ..options };
-            let made = self.work(&start, &gaussians, &[], &options)?;
+            let mut made = self.work(&start, &gaussians, &[], &options)?;
+            if self.mends {
+                let back = self.anchor();
+                made.gaussians = carried(&made.gaussians, |_| Some(back))?;
+                proof = carried(&proof, |_| Some(back))?;
+            }
             let steps = steps + made.steps;
-            found.report = self.report_of(&made, steps, [before, psnr]);
+            found.report = self.report_of(&start, &made, steps, [before, psnr]);
             found.versions += 1;
             let (gaussians, report) = (made.gaussians, found.report.clone());
-            let version = RefinedVersion { gaussians, report };
+            let version = RefinedVersion { gaussians, report, poses: self.poses() };
             (self.calls.publish)(&start, &version)?;
             whole = Some((start, version.gaussians, steps));
         }
         Ok(found)
+    }
+
+    /// Leaves photos out from now on that the proof does not explain at all: their cameras cannot be
+    /// right. Whether there are some.
+    fn leave_out(&mut self, start: &Scene, proof: &Gaussians) -> Result<bool> {
+        let shares = unexplained(self.renderer, start, proof, &self.photos)?;
+        let mut sorted = shares.clone();
+        sorted.sort_unstable_by(f64::total_cmp);
+        let least = LEFT_OUT_FROM.max(LEFT_OUT_FACTOR * sorted[sorted.len() / 2]);
+        self.left_out = (0..shares.len()).filter(|&i| shares[i] > least).collect();
+        tracing::debug!(?shares, left_out = ?self.left_out, "what photos the proof explains");
+        Ok(!self.left_out.is_empty())
+    }
+
+    /// Whether Gaussian `i` came from a photo that is left out.
+    fn is_left_out(&self, gaussians: &Gaussians, i: usize) -> bool {
+        self.left_out.contains(&usize::from(gaussians.source()[i].view))
+    }
+
+    /// The photos to learn from, and those of the numbers `held`.
+    fn parted(&self, held: &[usize]) -> (Vec<PosedPhoto>, Vec<PosedPhoto>) {
+        let (learnt, held) = self.numbers(held);
+        [learnt, held].map(|all| all.into_iter().map(|i| self.photos[i].clone()).collect()).into()
+    }
+
+    /// Their numbers.
+    fn numbers(&self, held: &[usize]) -> (Vec<usize>, Vec<usize>) {
+        let used = (0..self.photos.len()).filter(|i| !self.left_out.contains(i));
+        used.partition(|i| !held.contains(i))
+    }
+
+    /// PSNR of the scene without the photos `held`, as it is served, at these.
+    fn judged_before(&self, held: &[usize], start: &Scene) -> Result<Option<f64>> {
+        let held_photos = self.parted(held).1;
+        let judged = judged_as_served(self.renderer, start, &held_photos)?;
+        Ok(judged.map(|judged| judged.psnr))
+    }
+
+    /// The same where the cameras of these photos fit `first`, its one set of Gaussians, if cameras
+    /// are mended.
+    fn judged_before_fitting(
+        &mut self,
+        held: &[usize],
+        start: &Scene,
+        first: &Gaussians,
+    ) -> Result<Option<f64>> {
+        let now = self.poses();
+        if self.mends {
+            let poses = self.fitting(held, start, first)?;
+            self.stand(&self.numbers(held).1, &poses);
+        }
+        let before = self.judged_before(held, start);
+        self.stand_all(&now);
+        before
+    }
+
+    /// How the proof shows the held-out photos, which was `judged`, and what they gain by cameras
+    /// that fit it. Their cameras are as wrong as the others: where cameras are mended, or this
+    /// gain says that they are to be, theirs fit from now on.
+    fn fit_held_out(
+        &mut self,
+        held: &[usize],
+        start: &Scene,
+        proof: &Gaussians,
+        judged: Option<Judged>,
+    ) -> Result<(Option<Judged>, Option<f64>)> {
+        let now = self.poses();
+        let poses = self.fitting(held, start, proof)?;
+        self.stand(&self.numbers(held).1, &poses);
+        let fitting = judged_as_plain(self.renderer, start, proof, &self.parted(held).1)?;
+        let gain = judged.zip(fitting).map(|(judged, fitting)| fitting.score() - judged.score());
+        self.mends |= gain.is_some_and(|gain| gain > self.options.mends_from);
+        if self.mends {
+            return Ok((fitting, gain));
+        }
+        self.stand_all(&now);
+        Ok((judged, gain))
+    }
+
+    /// Where the cameras of the photos `held` fit these Gaussians.
+    fn fitting(
+        &mut self,
+        held: &[usize],
+        start: &Scene,
+        gaussians: &Gaussians,
+    ) -> Result<Vec<CameraToWorld>> {
+        let photos = self.parted(held).1;
+        self.fitting_photos(&photos, start, gaussians)
+    }
+
+    /// The same of these photos.
+    fn fitting_photos(
+        &mut self,
+        photos: &[PosedPhoto],
+        start: &Scene,
+        gaussians: &Gaussians,
+    ) -> Result<Vec<CameraToWorld>> {
+        let spent = self.spent(self.done.steps, self.done.time);
+        // Not more than was worked so far.
+        let most = self.done.steps / u32::try_from(photos.len().max(1)).unwrap_or(u32::MAX);
+        let steps = u8::try_from(most).unwrap_or(u8::MAX).clamp(1, ALIGNING_STEPS);
+        let (begun, mut waited) = (Instant::now(), Duration::ZERO);
+        let pace = &mut *self.calls.pace;
+        let mut pace = || {
+            let paused = Instant::now();
+            pace(spent)?;
+            waited += paused.elapsed();
+            Ok(())
+        };
+        let poses =
+            aligned(self.renderer, start, gaussians, photos, &self.options, steps, &mut pace)?;
+        self.done.time += begun.elapsed().saturating_sub(waited);
+        Ok(poses)
+    }
+
+    /// Brings the camera of each photo but those of `held` to where the Gaussians of the others say,
+    /// and its own Gaussians with it: these look right from where it stands, wherever that is.
+    fn settle_cameras(
+        &mut self,
+        held: &[usize],
+        start: &Scene,
+        gaussians: &Gaussians,
+    ) -> Result<Gaussians> {
+        let mut gaussians = gaussians.clone();
+        for _ in 0..SETTLING_ROUNDS {
+            for i in self.numbers(held).0 {
+                let others = gaussians.only(|at| usize::from(gaussians.source()[at].view) != i);
+                let Some(photo) = covered(self.renderer, start, &others, &self.photos[i])? else {
+                    continue;
+                };
+                let before = pose_of(&photo);
+                let poses = self.fitting_photos(&[photo], start, &others)?;
+                self.stand(&[i], &poses);
+                let motion = motion(&before, &poses[0]);
+                gaussians = carried(&gaussians, |view| (view == i).then_some(motion))?;
+            }
+        }
+        let back = self.anchor();
+        carried(&gaussians, |_| Some(back))
+    }
+
+    /// The Gaussians of the networks where the cameras of their photos stand now.
+    fn with_cameras(&self, gaussians: Gaussians) -> Result<Gaussians> {
+        let of = |view: usize| Some(motion(self.made.get(view)?, &pose_of(self.photos.get(view)?)));
+        if self.mends { carried(&gaussians, of) } else { Ok(gaussians) }
+    }
+
+    /// Moves all cameras together so that in the mean they stand as they were given, for nothing in
+    /// the photos tells where all of them are. The motion.
+    fn anchor(&mut self) -> (DQuat, DVec3) {
+        let used = self.numbers(&[]).0;
+        let turn = |i: &usize| motion(&self.given[*i], &pose_of(&self.photos[*i])).0;
+        let turns = used.iter().map(|i| turn(i).to_scaled_axis());
+        let back = DQuat::from_scaled_axis(-turns.sum::<DVec3>() / used.len() as f64);
+        let way = |i: &usize| self.given[*i].center() - back * pose_of(&self.photos[*i]).center();
+        let way = used.iter().map(way).sum::<DVec3>() / used.len() as f64;
+        for posed in &mut self.photos {
+            let pose = &mut posed.camera.camera_to_world;
+            let rotation = DMat3::from_quat(back) * pose.rotation();
+            *pose = CameraToWorld::from_rotation(rotation, back * pose.center() + way);
+        }
+        (back, way)
+    }
+
+    /// Where the cameras of all photos stand now.
+    fn poses(&self) -> Vec<CameraToWorld> {
+        self.photos.iter().map(pose_of).collect()
+    }
+
+    /// The cameras of these photos stand there from now on.
+    fn stand(&mut self, photos: &[usize], poses: &[CameraToWorld]) {
+        for (&i, pose) in photos.iter().zip(poses) {
+            self.photos[i].camera.camera_to_world = *pose;
+        }
+    }
+
+    fn stand_all(&mut self, poses: &[CameraToWorld]) {
+        let all: Vec<usize> = (0..poses.len()).collect();
+        self.stand(&all, poses);
+    }
+
+    /// How far the camera of each photo moved; none where they are not mended.
+    fn moved(&self, start: &Scene) -> Vec<MovedCamera> {
+        let moved = |(given, now): (&CameraToWorld, CameraToWorld)| MovedCamera {
+            degrees: given.turn_to(&now).to_degrees(),
+            share: given.center().distance(now.center()) / extent(start),
+        };
+        let all = self.given.iter().zip(self.poses());
+        if self.mends { all.map(moved).collect() } else { Vec::new() }
+    }
+
+    /// Share of the whole budget that so much is, 0..1.
+    fn spent(&self, steps: u32, time: Duration) -> f32 {
+        let budget = self.options.budget;
+        let steps = f64::from(steps) / f64::from(budget.steps.max(1));
+        let share = steps.max(time.as_secs_f64() / budget.time.as_secs_f64().max(1e-3));
+        #[expect(clippy::cast_possible_truncation, reason = "a share")]
+        let share = share.min(1.0) as f32;
+        share
     }
 
     /// The budget of the part that comes next; `None` where all is spent.
@@ -260,23 +536,22 @@ impl Parts<'_, '_> {
         held: &[usize],
         options: &RefineOptions,
     ) -> Result<Stepped> {
-        let (learnt, held_out) = split(&self.photos, held);
+        let (learnt, held_out) = self.parted(held);
         let (done, budget, plan) = (self.done, self.options.budget, options.budget);
-        let share = |steps: u32, time: Duration| {
-            let steps = f64::from(steps) / f64::from(budget.steps.max(1));
-            steps.max(time.as_secs_f64() / budget.time.as_secs_f64().max(1e-3))
-        };
-        let begin = share(done.steps, done.time);
-        let end = share(
+        let begin = self.spent(done.steps, done.time);
+        let end = self.spent(
             done.steps.saturating_add(plan.steps).min(budget.steps),
             done.time.saturating_add(plan.time).min(budget.time),
         );
-        #[expect(clippy::cast_possible_truncation, reason = "a share")]
-        let at = |spent: f32| (begin + (end - begin) * f64::from(spent)).min(1.0) as f32;
+        let at = |spent: f32| (begin + (end - begin) * spent).min(1.0);
         let mut pace = |spent: f32| (self.calls.pace)(at(spent));
-        let renderer = self.renderer;
+        let pose_rate = if self.mends { options.pose_rate } else { 0.0 };
+        let (renderer, options) = (self.renderer, RefineOptions { pose_rate, ..*options });
         let made =
-            refine::refine(renderer, start, gaussians, &learnt, &held_out, options, &mut pace)?;
+            refine::refine(renderer, start, gaussians, &learnt, &held_out, &options, &mut pace)?;
+        if self.mends {
+            self.stand(&self.numbers(held).0, &made.poses);
+        }
         self.done.steps += made.steps;
         self.done.time += made.time;
         Ok(made)
@@ -302,11 +577,14 @@ impl Parts<'_, '_> {
         proof_start: &Scene,
         proof: &Gaussians,
     ) -> Result<(f64, Scene, Gaussians)> {
-        let (start, gaussians) = self.begin(&[])?;
+        let (start, gaussians) = self.begin(&self.left_out.clone())?;
+        let gaussians = self.with_cameras(gaussians)?;
         let differs = |at: &dyn Fn(usize) -> usize| {
-            let photos: Vec<PosedPhoto> =
-                held.iter().map(|&i| self.photos[at(i)].clone()).collect();
-            mean_difference(self.renderer, proof_start, proof, &photos)
+            let is_used = |i: &usize| !self.left_out.contains(i);
+            let held = held.iter().filter(|&i| is_used(i) && is_used(&(i - 1)));
+            let photos: Vec<PosedPhoto> = held.map(|&i| self.photos[at(i)].clone()).collect();
+            let found = differences(self.renderer, proof_start, proof, &photos)?;
+            Ok::<_, crate::error::Error>(found.iter().sum::<f64>() / found.len() as f64)
         };
         // The photo before each is learnt.
         let overfit = differs(&|i| i)? / differs(&|i| i - 1)?;
@@ -333,12 +611,19 @@ impl Parts<'_, '_> {
             psnr_after: psnr,
             gaussians_before: gaussians,
             gaussians_after: gaussians,
+            left_out: self.left_out.iter().map(|&i| self.photos[i].file.clone()).collect(),
             ..RefineReport::default()
         }
     }
 
     /// The figures of a version that so many steps made of all photos.
-    fn report_of(&self, made: &Stepped, steps: u32, psnr: [Option<f64>; 2]) -> RefineReport {
+    fn report_of(
+        &self,
+        start: &Scene,
+        made: &Stepped,
+        steps: u32,
+        psnr: [Option<f64>; 2],
+    ) -> RefineReport {
         let [psnr_before, psnr_after] = psnr;
         RefineReport {
             steps,
@@ -346,6 +631,7 @@ impl Parts<'_, '_> {
             psnr_before,
             psnr_after,
             gaussians_after: made.gaussians.len() as u64,
+            cameras: self.moved(start),
             ..self.as_before(None)
         }
     }
@@ -412,6 +698,17 @@ fn share_of(count: u32, times: f32) -> u32 {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates")]
     let times = (f64::from(count) * f64::from(times)).round() as u32;
     times
+}
+
+/// The motion that brings a camera from one place to another: a rotation about the origin of the
+/// world, then a way.
+fn motion(from: &CameraToWorld, to: &CameraToWorld) -> (DQuat, DVec3) {
+    let turn = DQuat::from_mat3(&(to.rotation() * from.rotation().transpose())).normalize();
+    (turn, to.center() - turn * from.center())
+}
+
+fn pose_of(posed: &PosedPhoto) -> CameraToWorld {
+    posed.camera.camera_to_world
 }
 
 /// A photo whose longer side is `side` pixels, or as it is if that is shorter.
@@ -494,7 +791,10 @@ pub fn version_of(
         refinement: Some(reported(start.meta.cameras.len(), &version.report)),
         ..start.meta.report.clone()
     };
-    let meta = SceneMeta { report, ..start.meta.clone() };
+    let mut meta = SceneMeta { report, ..start.meta.clone() };
+    for (camera, pose) in meta.cameras.iter_mut().zip(&version.poses) {
+        camera.camera.camera_to_world = *pose;
+    }
     let plain = Scene {
         meta,
         gaussians: version.gaussians.clone(),

@@ -305,7 +305,7 @@ impl LabelledPhotos {
 }
 
 /// Refuses a scene whose Gaussians cannot be found in its photos.
-fn check_input(input: &SemanticsInput<'_>) -> Result<()> {
+pub(super) fn check_input(input: &SemanticsInput<'_>) -> Result<()> {
     let (photos, cameras) = (input.photos.len(), input.cameras.len());
     let named = input.photos.iter().zip(input.cameras).all(|(p, c)| p.file == c.file);
     if photos != cameras || !named {

@@ -20,13 +20,15 @@
 
 use std::time::{Duration, Instant};
 
+use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 use segsplat_render::{
     Background, DifferentiableRenderer, Frame, Kinds, RenderRequest,
     compare::psnr,
     plan::{default_near, served, widened},
     train::{
-        HostTrainer, Trainer, TrainingPhoto, TrainingSet, TrainingStep, checked, photo_loss, unit,
+        HostTrainer, PoseRates, Trainer, TrainingPhoto, TrainingSet, TrainingStep, checked,
+        photo_loss, unit,
     },
 };
 
@@ -34,7 +36,7 @@ pub use segsplat_render::train::LearningRates;
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Camera, Gaussians, Intrinsics, Photo, PosedPhoto, RefineReport, Scene},
+    scene::{Camera, CameraToWorld, Gaussians, Intrinsics, Photo, PosedPhoto, RefineReport, Scene},
 };
 
 /// Fewest photos of which one is held out.
@@ -74,6 +76,13 @@ const RATE_FACTOR_MAX: f32 = 2.0;
 const SSIM_DB: f64 = 20.0;
 /// How fast an exposure moves.
 const EXPOSURE_RATE: f32 = 5e-3;
+/// Gains of a photo's exposure that are believed where it is compared with a view.
+const GAINS: [f64; 2] = [0.4, 2.5];
+/// Opacity of a pixel that Gaussians cover, and share of a photo that they must.
+const COVERED: f32 = 0.9;
+const COVERED_MIN: f64 = 0.2;
+/// Steps in which the camera of a photo comes to fit Gaussians that stay.
+pub const ALIGNING_STEPS: u8 = 30;
 
 /// How long to refine: until either is spent. With steps alone the result is the same on every
 /// machine with the same lanes.
@@ -127,6 +136,12 @@ pub struct RefineOptions {
     pub prune_every: u32,
     /// Share of SSIM in the loss, 0..1.
     pub ssim_share: f32,
+    /// How far cameras turn in a step at first, radians, and move, as a share of the scene's median
+    /// depth; 0: they stay where they are.
+    pub pose_rate: f32,
+    /// What held-out photos must gain by cameras that fit what the others show, for cameras to be
+    /// learnt ([`Judged::score`], [`crate::pipeline::refinement::refined`]).
+    pub mends_from: f64,
     /// Steps until the first version ([`crate::pipeline::refinement::refined`]).
     pub first_steps: u32,
     /// What the work on a further version must gain on the held-out photos ([`Judged::score`]).
@@ -161,6 +176,8 @@ impl Default for RefineOptions {
             opacity_min: 0.01,
             prune_every: 50,
             ssim_share: 0.2,
+            pose_rate: 1e-3,
+            mends_from: 0.25,
             first_steps: 400,
             gain_min: 0.2,
             proof_share: 0.25,
@@ -179,6 +196,8 @@ pub struct RefinedVersion {
     pub gaussians: Gaussians,
     /// How good it is; which photos are held out is for the caller to say.
     pub report: RefineReport,
+    /// Where the cameras of all photos stand.
+    pub poses: Vec<CameraToWorld>,
 }
 
 /// What steps made.
@@ -192,6 +211,8 @@ pub struct Stepped {
     pub time: Duration,
     /// How they show the held-out photos; `None` without such photos.
     pub judged: Option<Judged>,
+    /// Where the cameras of the learnt photos stand.
+    pub poses: Vec<CameraToWorld>,
 }
 
 /// How near views are to photos that are not in a scene.
@@ -238,26 +259,63 @@ pub fn split(photos: &[PosedPhoto], held: &[usize]) -> (Vec<PosedPhoto>, Vec<Pos
     (of(false), of(true))
 }
 
-/// Mean absolute difference of what `gaussians` show, over what is behind those of `start`, and the
-/// photos, in 0..1; NaN of no photo. Exposures are left out, for nothing knows those of held-out
-/// photos.
+/// Mean absolute difference of what `gaussians` show, over what is behind those of `start`, and
+/// each photo, in 0..1. Exposures are left out, for nothing knows those of held-out photos.
 ///
 /// # Errors
 /// What the renderer says.
-pub fn mean_difference(
+pub fn differences(
     renderer: &dyn DifferentiableRenderer,
     start: &Scene,
     gaussians: &Gaussians,
     photos: &[PosedPhoto],
-) -> Result<f64> {
-    let mut sum = 0.0;
-    for posed in photos {
+) -> Result<Vec<f64>> {
+    let difference = |posed: &PosedPhoto| {
         let frame = renderer.render(gaussians, &plain_view(start, posed.camera))?;
         let (shown, photo) = (frame.color.unwrap_or_default(), unit(&posed.photo));
         let (width, valid) = (posed.photo.width as usize, posed.photo.valid.as_deref());
-        sum += photo_loss(&shown, &photo, width, valid, 0.0).value;
-    }
-    Ok(sum / photos.len() as f64)
+        Ok(photo_loss(&shown, &photo, width, valid, 0.0).value)
+    };
+    photos.iter().map(difference).collect()
+}
+
+/// How much of each photo `gaussians` do not explain, over what is behind those of `start`: the mean
+/// absolute difference after the best gain and bias of each channel, as a share of that of one plain
+/// colour. A photo whose camera stands elsewhere has about 1.
+///
+/// # Errors
+/// What the renderer says.
+pub fn unexplained(
+    renderer: &dyn DifferentiableRenderer,
+    start: &Scene,
+    gaussians: &Gaussians,
+    photos: &[PosedPhoto],
+) -> Result<Vec<f64>> {
+    let share = |posed: &PosedPhoto| {
+        let frame = renderer.render(gaussians, &plain_view(start, posed.camera))?;
+        let shown = frame.color.unwrap_or_default();
+        let photo = unit(&posed.photo);
+        let known = |i: &usize| posed.photo.valid.as_ref().is_none_or(|valid| valid[*i]);
+        let (mut left, mut all) = (0.0, 0.0);
+        for c in 0..3 {
+            let pairs = (0..photo.len()).filter(known);
+            let pairs = pairs.map(|i| (f64::from(shown[i][c]), f64::from(photo[i][c])));
+            let (mut count, mut sums) = (0.0, [0.0; 4]);
+            for (x, y) in pairs.clone() {
+                count += 1.0;
+                sums = [sums[0] + x, sums[1] + y, sums[2] + x * x, sums[3] + x * y];
+            }
+            let [x, y, xx, xy] = sums.map(|sum: f64| sum / f64::max(count, 1.0));
+            let variance = (xx - x * x).max(f64::MIN_POSITIVE);
+            let gain = ((xy - x * y) / variance).clamp(GAINS[0], GAINS[1]);
+            for (shown, known) in pairs {
+                left += (gain * (shown - x) - (known - y)).abs();
+                all += (known - y).abs();
+            }
+        }
+        Ok(left / f64::max(all, f64::MIN_POSITIVE))
+    };
+    photos.iter().map(share).collect()
 }
 
 /// A view of one set of Gaussians over what `start` has behind its own.
@@ -357,16 +415,17 @@ pub fn refine(
     if learnt.is_empty() || gaussians.is_empty() {
         let view = |camera| renderer.render(gaussians, &plain_view(start, camera));
         let (steps, time, judged) = (0, Duration::ZERO, judged(&held_out, view)?);
-        return Ok(Stepped { gaussians: gaussians.clone(), steps, time, judged });
+        let poses = learnt.iter().map(|posed| posed.camera.camera_to_world).collect();
+        return Ok(Stepped { gaussians: gaussians.clone(), steps, time, judged, poses });
     }
     // Behind the photos their smaller copies.
-    let coarse = coarse_copies(learnt, options);
-    let photos = learnt.iter().chain(&coarse).map(|posed| TrainingPhoto {
-        photo: &posed.photo,
-        request: plain_view(start, posed.camera),
-    });
+    let coarse = match options.coarse_share > 0.0 {
+        true => coarse_copies(learnt, options),
+        false => Vec::new(),
+    };
     let (ssim_share, gaussians_max) = (options.ssim_share, most_gaussians(learnt, options));
-    let set = TrainingSet { gaussians, photos: photos.collect(), ssim_share, gaussians_max };
+    let photos = [training_photos(start, learnt), training_photos(start, &coarse)].concat();
+    let set = TrainingSet { gaussians, photos, ssim_share, gaussians_max };
     let is_few = held_out.is_empty() && learnt.len() < HOLDS_OUT_FROM;
     let course = Course {
         is_few,
@@ -375,20 +434,115 @@ pub fn refine(
         gaussians: gaussians.len(),
         gaussians_max,
         rates: rates_of(start, options),
+        poses: pose_rates(start, options),
         options,
         order: Vec::new(),
         random: options.seed,
         grows_at: 0,
     };
-    let mut run = |trainer: &mut dyn Trainer| {
+    with_trainer(renderer, &set, options, |trainer| {
         let (steps, time) = course.clone().run(trainer, pace)?;
         let judged = judged(&held_out, |camera| trainer.render(&plain_view(start, camera)))?;
-        Ok(Stepped { gaussians: trainer.gaussians()?, steps, time, judged })
-    };
-    // The device first. What it has no room for, or what is lost with it, is done over.
+        let (gaussians, poses) = (trainer.gaussians()?, trainer.poses()?);
+        Ok(Stepped { gaussians, steps, time, judged, poses })
+    })
+}
+
+/// Where the cameras of photos stand so that they come closest to what `gaussians` show, over what
+/// is behind those of `start`: after so many steps for each that move nothing else. `pace` is called
+/// before each step.
+///
+/// # Errors
+/// What the renderer or `pace` says.
+pub fn aligned(
+    renderer: &dyn DifferentiableRenderer,
+    start: &Scene,
+    gaussians: &Gaussians,
+    photos: &[PosedPhoto],
+    options: &RefineOptions,
+    steps: u8,
+    pace: &mut dyn FnMut() -> Result<()>,
+) -> Result<Vec<CameraToWorld>> {
+    if photos.is_empty() || gaussians.is_empty() {
+        return Ok(photos.iter().map(|posed| posed.camera.camera_to_world).collect());
+    }
+    let coarse = coarse_copies(photos, options);
+    let photos = training_photos(start, if coarse.is_empty() { photos } else { &coarse });
+    let (count, ssim_share, gaussians_max) = (photos.len(), options.ssim_share, gaussians.len());
+    let set = TrainingSet { gaussians, photos, ssim_share, gaussians_max };
+    let poses = pose_rates(start, options);
+    with_trainer(renderer, &set, options, |trainer| {
+        for turn in 0..steps {
+            let fall = LAST_RATE.powf(f32::from(turn) / f32::from(steps));
+            let step = TrainingStep {
+                rates: options.rates.scaled(0.0),
+                exposure: EXPOSURE_RATE,
+                poses: poses.scaled(fall),
+                opacity_min: 0.0,
+            };
+            for at in 0..count {
+                pace()?;
+                trainer.step(&[at], &step)?;
+            }
+        }
+        trainer.poses()
+    })
+}
+
+/// A photo whose pixels count only where `gaussians` cover them; `None` where they cover little.
+///
+/// # Errors
+/// What the renderer says.
+pub(crate) fn covered(
+    renderer: &dyn DifferentiableRenderer,
+    start: &Scene,
+    gaussians: &Gaussians,
+    posed: &PosedPhoto,
+) -> Result<Option<PosedPhoto>> {
+    let kinds = Kinds { alpha: true, ..Kinds::COLOR };
+    let request = RenderRequest { kinds, ..plain_view(start, posed.camera) };
+    let alpha = renderer.render(gaussians, &request)?.alpha.unwrap_or_default();
+    let known = |i: usize| posed.photo.valid.as_ref().is_none_or(|valid| valid[i]);
+    let valid: Vec<bool> =
+        alpha.iter().enumerate().map(|(i, alpha)| *alpha >= COVERED && known(i)).collect();
+    let count = valid.iter().filter(|valid| **valid).count();
+    let photo = Photo { valid: Some(valid), ..posed.photo.clone() };
+    let share = count as f64 / alpha.len().max(1) as f64;
+    Ok((share >= COVERED_MIN).then(|| PosedPhoto { photo, ..posed.clone() }))
+}
+
+/// The Gaussians, each turned and moved by the motion that `of` gives for its photo: a rotation
+/// about the origin of the world, then a way.
+///
+/// # Errors
+/// `internal` where they cannot be Gaussians any more.
+pub(crate) fn carried(
+    gaussians: &Gaussians,
+    of: impl Fn(usize) -> Option<(DQuat, DVec3)>,
+) -> Result<Gaussians> {
+    let (origin, mut raw) = (gaussians.origin(), gaussians.clone().into_raw());
+    for i in 0..raw.means.len() {
+        let Some((turn, way)) = of(usize::from(raw.source[i].view)) else { continue };
+        let mean = DVec3::from_array(raw.means[i].map(f64::from)) + origin;
+        raw.means[i] = (turn * mean + way - origin).as_vec3().to_array();
+        let [w, x, y, z] = raw.quats[i].map(f64::from);
+        let quat = (turn * DQuat::from_xyzw(x, y, z, w)).normalize().as_quat();
+        raw.quats[i] = [quat.w, quat.x, quat.y, quat.z];
+    }
+    checked(raw)
+}
+
+/// Does `work` with a trainer of `set`: on a device first. What that has no room for, or what is
+/// lost with it, is done over.
+fn with_trainer<T>(
+    renderer: &dyn DifferentiableRenderer,
+    set: &TrainingSet<'_>,
+    options: &RefineOptions,
+    mut work: impl FnMut(&mut dyn Trainer) -> Result<T>,
+) -> Result<T> {
     let made = renderer
-        .trainer(&set, options.device_bytes_max)
-        .and_then(|trainer| trainer.map(|mut it| run(&mut *it)).transpose());
+        .trainer(set, options.device_bytes_max)
+        .and_then(|trainer| trainer.map(|mut it| work(&mut *it)).transpose());
     match made {
         Ok(None) => {}
         Ok(Some(made)) => return Ok(made),
@@ -397,7 +551,31 @@ pub fn refine(
         }
         Err(error) => return Err(error),
     }
-    run(&mut HostTrainer::new(renderer, &set)?)
+    work(&mut HostTrainer::new(renderer, set)?)
+}
+
+/// Photos for a trainer, each with a camera of its own.
+fn training_photos<'a>(start: &Scene, photos: &'a [PosedPhoto]) -> Vec<TrainingPhoto<'a>> {
+    let of = |(pose, posed): (usize, &'a PosedPhoto)| {
+        let request = plain_view(start, posed.camera);
+        TrainingPhoto { photo: &posed.photo, request, pose }
+    };
+    photos.iter().enumerate().map(of).collect()
+}
+
+/// How near what `gaussians` show, over what is behind those of `start`, is to photos that are not
+/// in them; `None` of no photo.
+///
+/// # Errors
+/// What the renderer says.
+pub fn judged_as_plain(
+    renderer: &dyn DifferentiableRenderer,
+    start: &Scene,
+    gaussians: &Gaussians,
+    held_out: &[PosedPhoto],
+) -> Result<Option<Judged>> {
+    let held_out: Vec<HeldOutPhoto> = held_out.par_iter().map(HeldOutPhoto::new).collect();
+    judged(&held_out, |camera| renderer.render(gaussians, &plain_view(start, camera)))
 }
 
 /// How near a scene as it is served, in layers where it has some, is to photos that are not in it;
@@ -433,20 +611,32 @@ fn judged(
     Ok((count > 0.0).then(|| Judged { psnr: sum.psnr / count, ssim: sum.ssim / count }))
 }
 
+/// The scene's median depth, world units; 1 where it has none.
+pub(crate) fn extent(start: &Scene) -> f64 {
+    let extent = start.meta.report.median_depth;
+    if extent.is_finite() && extent > 0.0 { extent } else { 1.0 }
+}
+
 /// The rates at first, means in world units.
 fn rates_of(start: &Scene, options: &RefineOptions) -> LearningRates {
-    let extent = start.meta.report.median_depth;
     #[expect(clippy::cast_possible_truncation, reason = "a length")]
-    let extent = if extent.is_finite() && extent > 0.0 { extent as f32 } else { 1.0 };
+    let extent = extent(start) as f32;
     let rates = LearningRates { means: options.rates.means * extent, ..options.rates };
     rates.scaled(options.rate)
 }
 
-/// The photos at half their size, where they are learnt so at first and are large enough.
+/// The same for cameras.
+fn pose_rates(start: &Scene, options: &RefineOptions) -> PoseRates {
+    #[expect(clippy::cast_possible_truncation, reason = "a length")]
+    let extent = extent(start) as f32;
+    PoseRates { turn: options.pose_rate, shift: options.pose_rate * extent }
+}
+
+/// The photos at half their size, where they are large enough.
 fn coarse_copies(photos: &[PosedPhoto], options: &RefineOptions) -> Vec<PosedPhoto> {
     let longer = |posed: &PosedPhoto| posed.photo.width.max(posed.photo.height);
     let least = photos.iter().map(longer).min().unwrap_or(0) / 2;
-    if options.coarse_share <= 0.0 || least < options.coarse_side_min {
+    if least < options.coarse_side_min {
         return Vec::new();
     }
     photos.par_iter().map(halved).collect()
@@ -505,6 +695,7 @@ struct Course<'a> {
     gaussians_max: usize,
     /// At first.
     rates: LearningRates,
+    poses: PoseRates,
     /// Photos that come next, the last one first.
     order: Vec<usize>,
     random: u64,
@@ -584,6 +775,7 @@ impl Course<'_> {
         TrainingStep {
             rates: self.rates.scaled(rate),
             exposure: EXPOSURE_RATE * rate,
+            poses: self.poses.scaled(rate),
             opacity_min: if prunes { self.options.opacity_min } else { 0.0 },
         }
     }

@@ -19,6 +19,7 @@ mod rows;
 mod score;
 mod tracks;
 mod views;
+mod words;
 
 pub use self::{
     assign::{from_source, relabel},
@@ -31,4 +32,5 @@ pub use self::{
     score::{Scorer, Scoring, TextScores, ViewNorms},
     tracks::{Tracks, tracks},
     views::{Views, merge},
+    words::{WordBank, lifted},
 };

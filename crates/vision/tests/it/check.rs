@@ -7,7 +7,9 @@ use segsplat_core::{
     scene::{Crop, Photo},
 };
 use segsplat_testing::{opened, root};
-use segsplat_vision::models::{Bundle, BundleCheck, Geometry, ImageText, Runtime, check};
+use segsplat_vision::models::{
+    Bundle, BundleCheck, Geometry, ImageText, Runtime, TextMaskNetwork, check,
+};
 use sha2::{Digest, Sha256};
 use tempfile::TempDir;
 
@@ -48,6 +50,15 @@ fn with_image(file: &str) -> TempDir {
         let lines = format!("\"{file}\"\ndata = \"{DATA}\"\ndata_sha256 = \"{sha256}\"");
         replace(&dir, &format!("\"{file}\""), &lines);
     }
+    dir
+}
+
+/// The bundle of colours with its network of text masks.
+fn with_text_masks() -> TempDir {
+    let dir = with_image("image.onnx");
+    let section = std::fs::read_to_string(dir.path().join("text_masks.toml")).unwrap();
+    let path = dir.path().join(MANIFEST);
+    std::fs::write(&path, std::fs::read_to_string(&path).unwrap() + &section).unwrap();
     dir
 }
 
@@ -222,6 +233,51 @@ fn a_tower_with_a_dense_output_gives_features_of_a_whole_photo() {
     replace(&dir, "side = 32", "side = 4");
     let named = ["image_text.image.dense.side is 4; it must be 8 to", "dense.weights is [[0.5"];
     refused(&dir, &named);
+}
+
+#[test]
+fn a_network_of_text_masks_is_run_and_marks_what_a_text_says() {
+    let dir = with_text_masks();
+    let Some(found) = checked(&dir) else { return };
+    assert_eq!(found.faults, Vec::<String>::new(), "{found:?}");
+    let ran: Vec<&str> = found.ran.iter().map(|(name, _)| *name).collect();
+    assert_eq!(ran, ["geometry", "masks", "image_text", "text_masks"]);
+
+    let runtime = Runtime::load(&network_options()).unwrap();
+    let open = |dir: &TempDir| {
+        let bundle = Bundle::open(dir.path()).unwrap();
+        TextMaskNetwork::open(&runtime, &bundle, &network_options())
+    };
+    let network = open(&dir).unwrap().unwrap();
+    // Red to the left, green to the right, whatever its shape.
+    for [width, height] in [[80_u32, 38], [40, 90]] {
+        let row =
+            (0..width).flat_map(|x| if x < width / 2 { [204, 26, 26] } else { [26, 178, 26] });
+        let rgb = row.collect::<Vec<u8>>().repeat(height as usize);
+        let seen = network.see(&Photo { width, height, rgb, valid: None }).unwrap();
+        let scores = |text: &str| {
+            let map = network.find(&seen, text).unwrap();
+            [map.at(0.25, 0.5), map.at(0.75, 0.1)]
+        };
+        assert_eq!(scores("a red thing"), [900, 0], "the mask of all is not sure enough");
+        assert_eq!(scores("grass"), [0, 900]);
+        assert_eq!(scores("sky"), [0, 0]);
+        // Over its last token a text is cut.
+        assert_eq!(scores(&("the ".repeat(16) + "red")), [0, 0]);
+        let error = network.find(&seen, " ").unwrap_err();
+        assert_eq!(error.code(), ErrorCode::InvalidRequest, "{error}");
+    }
+    let plain = open(&with_image("image.onnx")).unwrap();
+    assert!(plain.is_none(), "a bundle without one");
+
+    replace(&dir, "masks = \"masks\"", "masks = \"outlines\"");
+    let error = open(&dir).unwrap_err();
+    assert!(error.message().contains("has no output \"outlines\""), "{error}");
+    replace(&dir, "features = [\"cells\"]", "features = [\"cells\"]\nthreshold = 0.2");
+    refused(&dir, &["unknown field `threshold`"]);
+    let dir = with_text_masks();
+    replace(&dir, "[text_masks]\n", "[text_masks]\nthreshold = 0.2\n");
+    refused(&dir, &["text_masks.threshold is 0.2; it must be 0.5 to 1"]);
 }
 
 #[test]

@@ -9,29 +9,30 @@ use std::{
     time::{Duration, Instant},
 };
 
+use glam::DVec3;
 use segsplat_core::{
     error::{Error, ErrorCode, Result},
     scene::{
-        Backdrop, Camera, Gaussians, HealthReport, Photo, PosedPhoto, Provenance, Scene,
-        SceneCamera, SceneId, SceneMeta, SourcePixel,
+        Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Photo, PosedPhoto, Provenance,
+        Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
     },
 };
 use segsplat_render::{
     Background, DifferentiableRenderer, Frame, Kinds, RenderRequest, Renderer,
     backward::{FrameGradients, Gradients},
     cpu::CpuRenderer,
-    train::{Trainer, TrainingSet},
+    train::{Trainer, TrainingSet, pose::moved},
 };
 use segsplat_testing::scenes::{Random, camera, checked, cloud, look};
 use segsplat_vision::{
     pipeline::{
         Reconstruction,
-        refinement::{self, RefineCalls, Refined},
+        refinement::{self, RefineCalls, Refined, version_of},
     },
     refine::{
         HOLDS_OUT_FROM, Judged, RefineBudget, RefineOptions, RefinedVersion, Stepped,
-        UNWATCHED_STEPS_MAX, held_out, judged_as_served, mean_difference, rate_factor, ready,
-        refine, split,
+        UNWATCHED_STEPS_MAX, differences, held_out, judged_as_served, rate_factor, ready, refine,
+        split,
     },
 };
 
@@ -104,8 +105,8 @@ fn refined(
     steps: u32,
 ) -> Stepped {
     let budget = RefineBudget::steps(steps);
-    let options =
-        RefineOptions { budget, growth: 0.0, coarse_share: 0.3, ..RefineOptions::default() };
+    let plain = RefineOptions::default();
+    let options = RefineOptions { budget, growth: 0.0, coarse_share: 0.3, pose_rate: 0.0, ..plain };
     refined_by(renderer, start, photos, &options)
 }
 
@@ -255,7 +256,8 @@ fn refined_whole(
         Ok(())
     };
     let pace = &mut |_: f32| Ok(());
-    let calls = RefineCalls { remake: &mut remake, pace, publish: &mut publish };
+    let recast = &mut || Ok(None);
+    let calls = RefineCalls { remake: &mut remake, recast, pace, publish: &mut publish };
     let found = refinement::refined(renderer, &scene, photos, options, calls);
     Whole { found: found.expect("refined"), versions }
 }
@@ -350,7 +352,8 @@ fn it_goes_on_from_the_proof_where_that_explains_photos_that_it_did_not_learn() 
     let held = held_out(photos.len());
     let differs = |whole: &Whole| {
         let (start, version) = whole.last();
-        mean_difference(&cpu(), start, &version.gaussians, &photos).expect("views")
+        let found = differences(&cpu(), start, &version.gaussians, &photos).expect("views");
+        found.iter().sum::<f64>() / found.len() as f64
     };
     // Whether the Gaussians of held-out photos are behind the others.
     let joined = |whole: &Whole| {
@@ -378,6 +381,97 @@ fn it_goes_on_from_the_proof_where_that_explains_photos_that_it_did_not_learn() 
     let full = with(f32::MAX, 400);
     let count = full.last().1.gaussians.len();
     assert!(joined(&full) && count <= 400 && count > 360, "{count} Gaussians");
+}
+
+/// Photos whose cameras are turned by `degrees` and moved by `way`, each in its own direction.
+fn with_wrong_cameras(photos: &[PosedPhoto], degrees: f64, way: f64) -> Vec<PosedPhoto> {
+    let mut random = Random(40);
+    let wrong = |posed: &PosedPhoto| {
+        let [turn, shift] = [(); 2].map(|()| {
+            let numbers = [(); 3].map(|()| f64::from(random.range(-1.0, 1.0)));
+            glam::DVec3::from_array(numbers).normalize()
+        });
+        let pose = &posed.camera.camera_to_world;
+        let camera_to_world = moved(pose, turn * degrees.to_radians(), shift * way);
+        PosedPhoto { camera: Camera { camera_to_world, ..posed.camera }, ..posed.clone() }
+    };
+    photos.iter().map(wrong).collect()
+}
+
+/// How far cameras are apart, radians in the mean: a turn of all of them together is none.
+fn apart(poses: &[CameraToWorld], right: &[PosedPhoto]) -> f64 {
+    let (mut sum, mut count) = (0.0, 0.0);
+    for i in 0..poses.len() {
+        for j in 0..i {
+            let between = |a: &CameraToWorld, b: &CameraToWorld| {
+                CameraToWorld::from_rotation(a.rotation().transpose() * b.rotation(), DVec3::ZERO)
+            };
+            let [a, b] = [i, j].map(|i| &right[i].camera.camera_to_world);
+            sum += between(&poses[i], &poses[j]).turn_to(&between(a, b));
+            count += 1.0;
+        }
+    }
+    sum / count
+}
+
+#[test]
+fn wrong_cameras_are_mended_where_held_out_photos_say_so() {
+    let (_, right) = captured(9);
+    let wrong = with_wrong_cameras(&right, 2.0, 0.06);
+    let with = |photos: &[PosedPhoto], pose_rate: f32| {
+        let options = RefineOptions { pose_rate, ..steps_of(480, 120) };
+        refined_whole(&cpu(), photos, &options, &|| ())
+    };
+    let mended = with(&wrong, 4e-3);
+    let (start, last) = mended.last();
+    let given: Vec<CameraToWorld> = wrong.iter().map(|it| it.camera.camera_to_world).collect();
+    let (before, after) = (apart(&given, &right), apart(&last.poses, &right));
+    println!("{before} before, {after} after, gain {:?}", mended.found.pose_gain);
+    assert!(after < 0.5 * before, "{after} radians after, {before} before");
+    // The report says how far each moved, the version where it stands.
+    let told = &last.report.cameras;
+    assert_eq!(told.len(), 9);
+    for ((told, given), pose) in told.iter().zip(&given).zip(&last.poses) {
+        assert!((told.degrees - given.turn_to(pose).to_degrees()).abs() < 1e-9);
+        assert!((told.share - given.center().distance(pose.center()) / 3.0).abs() < 1e-9);
+    }
+    assert!(told.iter().all(|it| it.degrees > 0.1 && it.share > 1e-3), "{told:?}");
+    let version = version_of(start, start, last).expect("a scene");
+    let cameras = version.meta.cameras.iter().map(|it| it.camera.camera_to_world);
+    assert!(cameras.eq(last.poses.iter().copied()));
+    let psnr = |whole: &Whole| whole.last().1.report.psnr_after.expect("held-out photos");
+    let left = with(&wrong, 0.0);
+    println!("{} dB mended, {} as given", psnr(&mended), psnr(&left));
+    assert!(psnr(&mended) > psnr(&left) + 1.0);
+    assert!(left.last().1.poses == given && left.last().1.report.cameras.is_empty());
+    assert_eq!(left.found.pose_gain, None);
+    // Right cameras stay, and nothing else changes.
+    let (asked, never) = (with(&right, 4e-3), with(&right, 0.0));
+    println!("gain with right cameras {:?}", asked.found.pose_gain);
+    assert!(asked.found.pose_gain.expect("asked") < mended.found.pose_gain.expect("asked"));
+    assert!(asked.last().1.report.cameras.is_empty());
+    let [asked, never] = [asked, never].map(|it| it.last().1.gaussians.means().to_vec());
+    assert!(asked == never);
+}
+
+#[test]
+fn photos_whose_cameras_cannot_be_right_are_left_out_and_named() {
+    let (_, right) = captured(9);
+    let refined = |photos: &[PosedPhoto]| refined_whole(&cpu(), photos, &steps_of(160, 80), &|| ());
+    let plain = refined(&right);
+    assert!(plain.last().1.report.left_out.is_empty(), "{:?}", plain.last().1.report);
+    // One looks the other way, where its photo never was.
+    let mut wrong = right.clone();
+    let pose = &mut wrong[3].camera.camera_to_world;
+    *pose = moved(pose, DVec3::new(0.0, 0.0, 3.0), DVec3::ZERO);
+    let found = refined(&wrong);
+    let (start, last) = found.last();
+    assert_eq!(last.report.left_out, [right[3].file.clone()]);
+    // Neither its photo nor its Gaussians are in the scene.
+    assert!(last.gaussians.source().iter().all(|pixel| pixel.view != 3));
+    assert!(start.gaussians.source().iter().all(|pixel| pixel.view != 3));
+    assert!(last.report.psnr_after > last.report.psnr_before, "{:?}", last.report);
+    assert_eq!(last.poses.len(), 9);
 }
 
 #[test]

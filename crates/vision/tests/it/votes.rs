@@ -4,7 +4,7 @@ use segsplat_core::scene::{
     Bank, Camera, CameraToWorld, Gaussians, IndexMap, Intrinsics, RawGaussians, SceneCamera,
     SourcePixel,
 };
-use segsplat_vision::semantics::{Views, from_source, merge};
+use segsplat_vision::semantics::{Views, from_source, lifted, merge};
 
 const SIDE: u16 = 20;
 
@@ -92,6 +92,25 @@ fn a_photo_that_sees_something_else_there_has_no_vote() {
     let voted = Views::new(&gaussians, &cameras(2)).vote(&own, &maps);
     assert!(voted[..400].iter().all(|m| *m == 0), "the wall is hidden from photo 1");
     assert!(voted[400..].iter().all(|m| *m == 7), "the screen keeps its own");
+}
+
+#[test]
+fn a_word_is_where_half_of_the_photos_that_show_it_have_it() {
+    let gaussians = wall(3, |_| 10.0);
+    // As above; photo 1 has the word in the upper half alone, photo 2 nowhere.
+    let mut maps = vec![map(12, 900), map(10, 700), map(20, 0)];
+    maps[1].index[200..].fill(0);
+    let own = own(&gaussians, &maps);
+    let scores = lifted(&Views::new(&gaussians, &cameras(3)), &own, &maps);
+    let at = |x: usize, y: usize| scores[y * 20 + x];
+    assert_eq!(at(15, 5), 800, "two of three have it: their mean");
+    assert_eq!(at(15, 15), 0, "one of three");
+    assert_eq!(at(5, 5), 0, "none");
+    // Column 1 of photo 0 is beyond the others: it alone shows it.
+    let alone = vec![map(0, 600), map(20, 0), map(20, 0)];
+    let own = from_source(gaussians.source(), &cameras(3), &alone);
+    let scores = lifted(&Views::new(&gaussians, &cameras(3)), &own, &alone);
+    assert_eq!((scores[5 * 20 + 1], scores[5 * 20 + 15]), (600, 0));
 }
 
 fn rows(rows: &[[f32; 2]]) -> Bank {
