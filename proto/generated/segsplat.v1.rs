@@ -1169,6 +1169,39 @@ pub struct RefineSceneRequest {
     #[prost(string, tag = "2")]
     pub refine: ::prost::alloc::string::String,
 }
+/// Whose edits.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct GetEditsRequest {
+    /// Id.
+    #[prost(string, tag = "1")]
+    pub scene_id: ::prost::alloc::string::String,
+}
+/// A list of edits in place of the one before.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SetEditsRequest {
+    /// Id.
+    #[prost(string, tag = "1")]
+    pub scene_id: ::prost::alloc::string::String,
+    /// The list as JSON, as HTTP has it: \[{"op": "delete", "select": {"text": "chair"}}\].
+    #[prost(bytes = "bytes", tag = "2")]
+    pub edits_json: ::prost::bytes::Bytes,
+    /// Milliseconds to wait for semantics that are being made.
+    #[prost(uint64, optional, tag = "3")]
+    pub semantics_wait_ms: ::core::option::Option<u64>,
+}
+/// The edits of a scene and what they come to.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SceneEdits {
+    /// The list as JSON, as it can be sent again.
+    #[prost(string, tag = "1")]
+    pub edits_json: ::prost::alloc::string::String,
+    /// Gaussians of the served version that each edit took.
+    #[prost(uint64, repeated, tag = "2")]
+    pub counts: ::prost::alloc::vec::Vec<u64>,
+    /// Gaussians of the scene after all of them.
+    #[prost(uint64, tag = "3")]
+    pub gaussians: u64,
+}
 /// One view.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct RenderViewRequest {
@@ -2223,6 +2256,50 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("segsplat.v1.SceneService", "RefineScene"));
             self.inner.unary(req, path, codec).await
         }
+        /// The edits of a scene, and how many Gaussians each took.
+        pub async fn get_edits(
+            &mut self,
+            request: impl tonic::IntoRequest<super::GetEditsRequest>,
+        ) -> std::result::Result<tonic::Response<super::SceneEdits>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/segsplat.v1.SceneService/GetEdits",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("segsplat.v1.SceneService", "GetEdits"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Replaces the edits of a scene; an empty list brings back every bit.
+        pub async fn set_edits(
+            &mut self,
+            request: impl tonic::IntoRequest<super::SetEditsRequest>,
+        ) -> std::result::Result<tonic::Response<super::SceneEdits>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/segsplat.v1.SceneService/SetEdits",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("segsplat.v1.SceneService", "SetEdits"));
+            self.inner.unary(req, path, codec).await
+        }
         /// One rendered view.
         pub async fn render_view(
             &mut self,
@@ -2445,6 +2522,16 @@ pub mod scene_service_server {
             &self,
             request: tonic::Request<super::RefineSceneRequest>,
         ) -> std::result::Result<tonic::Response<super::Scene>, tonic::Status>;
+        /// The edits of a scene, and how many Gaussians each took.
+        async fn get_edits(
+            &self,
+            request: tonic::Request<super::GetEditsRequest>,
+        ) -> std::result::Result<tonic::Response<super::SceneEdits>, tonic::Status>;
+        /// Replaces the edits of a scene; an empty list brings back every bit.
+        async fn set_edits(
+            &self,
+            request: tonic::Request<super::SetEditsRequest>,
+        ) -> std::result::Result<tonic::Response<super::SceneEdits>, tonic::Status>;
         /// One rendered view.
         async fn render_view(
             &self,
@@ -2837,6 +2924,96 @@ pub mod scene_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = RefineSceneSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/segsplat.v1.SceneService/GetEdits" => {
+                    #[allow(non_camel_case_types)]
+                    struct GetEditsSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::UnaryService<super::GetEditsRequest>
+                    for GetEditsSvc<T> {
+                        type Response = super::SceneEdits;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::GetEditsRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::get_edits(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = GetEditsSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/segsplat.v1.SceneService/SetEdits" => {
+                    #[allow(non_camel_case_types)]
+                    struct SetEditsSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::UnaryService<super::SetEditsRequest>
+                    for SetEditsSvc<T> {
+                        type Response = super::SceneEdits;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::SetEditsRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::set_edits(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = SetEditsSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

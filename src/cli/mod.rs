@@ -7,6 +7,7 @@
 mod bench;
 mod camera;
 mod cameras;
+mod edit;
 pub mod engine;
 mod export;
 mod features;
@@ -66,6 +67,8 @@ enum Command {
     Render(Box<render::Args>),
     /// Search a scene by text, in 3D and in a view
     Query(Box<query::Args>),
+    /// Write a scene after a list of edits: delete, keep, move, copy, recolour
+    Edit(edit::Args),
     /// Write the bank of a scene, or the pixels of a view over it, as an npz file
     Features(Box<features::Args>),
     /// Write a scene for other programs: Gaussians, or a folder with photos and depth or masks
@@ -90,6 +93,7 @@ impl Command {
             Self::Cameras(args) => common(&args.config),
             Self::Render(args) => common(&args.config),
             Self::Query(args) => common(&args.config),
+            Self::Edit(args) => common(&args.config),
             Self::Features(args) => common(&args.config),
             Self::Models(args) => common(&args.config),
             Self::Bench(args) => common(&args.config),
@@ -161,6 +165,7 @@ fn dispatch(cli: &Cli, out: &Output) -> Result<()> {
         Command::Cameras(args) => cameras::run(args, &config, out),
         Command::Render(args) => render::run(args, &config, out),
         Command::Query(args) => query::run(args, &config, out),
+        Command::Edit(args) => edit::run(args, &config, out),
         Command::Features(args) => features::run(args, &config, out),
         Command::Export(args) => export::run(args, &config, out),
         Command::Inspect(args) => inspect::run(args, &config, out),

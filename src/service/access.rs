@@ -1,8 +1,8 @@
 //! The check of a scene's owner, as a type that all code which uses a scene requires.
 
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 
-use super::{shared::Service, tasks::blocking};
+use super::{edits::EditList, shared::Service, tasks::blocking};
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::{SceneError, SceneId, SceneState},
@@ -14,6 +14,8 @@ use crate::{
 #[derive(Clone, Debug)]
 pub(super) struct SceneAccess {
     record: Arc<Record>,
+    /// Why it cannot be drawn where its list cannot be read.
+    edits: Result<Arc<EditList>, SceneError>,
 }
 
 impl SceneAccess {
@@ -26,8 +28,27 @@ impl SceneAccess {
         &self.record
     }
 
+    /// Its edits at the time of the check.
+    pub(super) fn edits(&self) -> &EditList {
+        static NONE: LazyLock<EditList> = LazyLock::new(EditList::default);
+        self.edits.as_deref().unwrap_or(&NONE)
+    }
+
     /// The same scene, where it can be rendered.
     pub(super) fn finished(self) -> Result<Self> {
+        let access = self.done()?;
+        match &access.edits {
+            Ok(_) => Ok(access),
+            Err(error) => Err(error.to_error()),
+        }
+    }
+
+    /// The scene as it was made, without its edits, where that can be rendered.
+    pub(super) fn unedited(self) -> Result<Self> {
+        Ok(Self { edits: Ok(Arc::default()), ..self.done()? })
+    }
+
+    fn done(self) -> Result<Self> {
         let (status, id) = (&self.record.status, self.id());
         let not_ready = |why: String| Err(Error::new(ErrorCode::SceneNotReady, why));
         match (status.state, &status.error) {
@@ -55,10 +76,13 @@ impl Service {
             blocking(move || inner.jobs.refresh(&id)).await??;
         }
         let record = self.inner.jobs.record(id)?;
-        if self.caller.sees(record.owner.as_deref()) {
-            Ok(SceneAccess { record })
-        } else {
-            Err(not_found(id))
+        if !self.caller.sees(record.owner.as_deref()) {
+            return Err(not_found(id));
         }
+        let edits = match record.status.state {
+            SceneState::Done => self.inner.edit_list(id).await.map_err(|e| SceneError::from(&e)),
+            _ => Ok(Arc::default()),
+        };
+        Ok(SceneAccess { record, edits })
     }
 }

@@ -5,6 +5,7 @@
 mod access;
 mod camera;
 mod create;
+mod edits;
 mod encode;
 mod export;
 mod features;
@@ -33,6 +34,7 @@ mod work;
 
 pub(crate) use self::refine::check_refine;
 pub use self::{
+    edits::{EditBox, EditOp, EditPick, EditSelection, EditSpec, EditSphere, SceneEdits},
     export::scene_splats,
     folder::FolderSpec,
     infer::InferSpec,

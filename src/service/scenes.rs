@@ -57,7 +57,9 @@ impl Service {
     pub async fn delete(&self, id: &SceneId) -> Result<()> {
         let scene = self.scene(id).await?;
         let (inner, gone) = (Arc::clone(&self.inner), scene.id().clone());
-        tasks::blocking(move || inner.jobs.delete(&gone)).await?
+        let deleted = tasks::blocking(move || inner.jobs.delete(&gone)).await?;
+        self.inner.edits.forget(id);
+        deleted
     }
 
     /// What happens to a scene, from its present state to the last event, or until the server

@@ -62,8 +62,13 @@ impl Shared {
         ))
     }
 
-    /// The scene itself. It is marked as failed when its file is bad. Blocks on the store.
+    /// The scene after its edits: what is drawn, asked and exported. Blocks on the store.
     pub(super) fn load(&self, access: &SceneAccess) -> Result<Arc<Scene>> {
+        self.edited(access, self.load_unedited(access)?)
+    }
+
+    /// The scene as it was made. It is marked as failed when its file is bad. Blocks on the store.
+    pub(super) fn load_unedited(&self, access: &SceneAccess) -> Result<Arc<Scene>> {
         let (scene, _ms) = staged("load", || self.store.scene(access.id()));
         scene.inspect_err(|error| {
             if error.code() == ErrorCode::SceneCorrupt {
@@ -75,9 +80,9 @@ impl Shared {
     /// The scene with its semantics; `None` where they must be made again: their file was put
     /// aside, or other networks made them, whose embeddings cannot be compared with texts of these.
     fn load_semantics(&self, access: &SceneAccess) -> Result<Option<SemanticScene>> {
-        let scene = self.load(access)?;
+        let scene = self.load_unedited(access)?;
         let found = self.semantics_of(Arc::clone(&scene));
-        if found.is_none() {
+        let Some(found) = found else {
             if let Some(semantics) = &scene.semantics
                 && let Some(why) = self.why_foreign(
                     scene.meta.report.file_format.as_ref(),
@@ -90,8 +95,9 @@ impl Shared {
             self.store.check_semantics(access.id())?;
             tracing::info!(scene = %access.id(), "no semantics of this bundle: made again");
             self.jobs.lose_semantics(access.id())?;
-        }
-        Ok(found)
+            return Ok(None);
+        };
+        Ok(SemanticScene::new(self.edited(access, found.scene)?))
     }
 
     /// A scene and its semantics, where the loaded bundle made them.
@@ -137,6 +143,8 @@ impl Shared {
                 _ => return Err(not_yet(&record.status, what)),
             }
             let kept = self.store.scene_in_memory(id).and_then(|scene| self.semantics_of(scene));
+            let kept = kept.and_then(|of| self.edited_in_memory(access, of.scene));
+            let kept = kept.and_then(SemanticScene::new);
             let found = match kept {
                 Some(kept) => Some(kept),
                 None => {

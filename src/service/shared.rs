@@ -5,6 +5,7 @@ use std::{fmt, sync::Arc};
 use tokio::sync::{Semaphore, watch};
 
 use super::{
+    edits::Edits,
     memory::{Memory, Share},
     schedule::Scheduler,
     search::Backend,
@@ -59,6 +60,7 @@ pub(super) struct Shared {
     /// Caps in force: those of the configuration, or newer ones. The jobs have the same.
     pub(super) limits: Arc<LiveLimits>,
     pub(super) store: Arc<Store>,
+    pub(super) edits: Edits,
     pub(super) jobs: Arc<Jobs>,
     /// Networks that run by themselves; the jobs have the same.
     pub(super) networks: Arc<dyn SceneNetworks>,
@@ -137,6 +139,7 @@ impl Service {
         let (renderer, semantics) = (parts.renderer, parts.semantics);
         let backend = Backend::new(renderer, semantics, &models.words, &config.limits);
         let inner = Shared {
+            edits: Edits::new(&config.limits),
             store,
             jobs,
             networks,
@@ -224,7 +227,7 @@ impl Service {
 
     /// Bytes of scenes in memory.
     pub fn cached_bytes(&self) -> u64 {
-        self.inner.store.cached_bytes()
+        self.inner.store.cached_bytes() + self.inner.edits.cached_bytes()
     }
 
     /// Bytes of photos in memory, for jobs and for first texts.

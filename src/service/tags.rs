@@ -34,12 +34,19 @@ pub(super) fn text_key(
 
 /// Tells a version of a scene from all others.
 pub(super) fn scene_tag(scene: &Scene) -> String {
-    tag(&scene.sha256, &scene.meta.id)
+    tag(&scene.sha256, &scene.meta.id, &scene.edits_sha256, &scene.semantics_sha256)
 }
 
-/// The tag of the version that a record names. Another one may be served a moment later.
-pub(super) fn record_tag(record: &Record) -> String {
-    tag(record.scene_sha256.as_deref().unwrap_or_default(), &record.status.id)
+/// Tells a version of a scene and the edits of a list, by the hash of the list, from all others.
+pub(super) fn edits_tag(base: &Scene, edits_sha256: &str) -> String {
+    tag(&base.sha256, &base.meta.id, edits_sha256, &base.semantics_sha256)
+}
+
+/// The tag of the version that a record names, after the edits of a list of this hash. Others may be served a moment later.
+pub(super) fn record_tag(record: &Record, edits_sha256: &str) -> String {
+    let [scene, semantics] =
+        [&record.scene_sha256, &record.semantics_sha256].map(|of| of.as_deref().unwrap_or(""));
+    tag(scene, &record.status.id, edits_sha256, semantics)
 }
 
 /// Tells a version of a scene and its semantics from all others.
@@ -48,11 +55,15 @@ pub(super) fn semantics_tag(scene: &Scene) -> String {
 }
 
 /// The same of the version that a record names.
-pub(super) fn record_semantics_tag(record: &Record) -> String {
+pub(super) fn record_semantics_tag(record: &Record, edits_sha256: &str) -> String {
     let semantics = record.semantics_sha256.as_deref().unwrap_or_default();
-    format!("{} {semantics}", record_tag(record))
+    format!("{} {semantics}", record_tag(record, edits_sha256))
 }
 
-fn tag(sha256: &str, id: &SceneId) -> String {
-    format!("{sha256} {id}")
+/// Without edits a view does not depend on the semantics; edits may take what they select.
+fn tag(sha256: &str, id: &SceneId, edits: &str, semantics: &str) -> String {
+    match edits {
+        "" => format!("{sha256} {id}"),
+        edits => format!("{sha256} {id} {edits} {semantics}"),
+    }
 }

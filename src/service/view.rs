@@ -465,17 +465,17 @@ impl Service {
     /// As [`Self::render`], without those of the rendering itself.
     pub async fn view_etag(&self, id: &SceneId, spec: &ViewSpec) -> Result<Option<String>> {
         let (scene, ask, view) = self.checked_view(id, spec).await?;
-        let record = scene.record();
+        let (record, edits) = (scene.record(), scene.edits().sha256());
         let text = match (spec.kind.needs_semantics(), &record.semantics_sha256) {
             (false, _) => String::new(),
             (true, Some(_)) => {
-                let tag = record_semantics_tag(record);
+                let tag = record_semantics_tag(record, edits);
                 text_key(&tag, ask.text.as_deref(), view.preset, &ask.scoring)?
             }
             (true, None) => return Ok(None),
         };
         let name = self.inner.backend.renderer.name();
-        view.etag(&record_tag(record), &name, spec.kind, &text).map(Some)
+        view.etag(&record_tag(record, edits), &name, spec.kind, &text).map(Some)
     }
 
     /// Renders and encodes one view.

@@ -4,6 +4,7 @@
 //! scenes/ID/upload.segsplat     photos and cameras as sent, with the first record
 //! scenes/ID/scene.segsplat      the finished scene
 //! scenes/ID/semantics.segsplat  its semantics, once a text needed them
+//! scenes/ID/edits.json          its list of edits, once there was one
 //! scenes/ID/status.json         the record of what is over: done or failed
 //! scenes/ID/*.quarantined       an object that failed its checksum
 //! pending/ID                    the record of what is not over; gone soon after there is a status
@@ -16,6 +17,7 @@
 //! while it has a status or a pending record; a sweep removes objects of scenes that have neither.
 //! A bad object is put aside, and the start goes on.
 
+mod edits;
 mod files;
 mod hashes;
 mod index;
@@ -56,6 +58,7 @@ use crate::{
 
 const UPLOAD: &str = "upload.segsplat";
 const STATUS: &str = "status.json";
+const EDITS: &str = "edits.json";
 const SCENE: &str = "scene.segsplat";
 const SEMANTICS: &str = "semantics.segsplat";
 const PROBE: &str = "probe";

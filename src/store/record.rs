@@ -79,7 +79,8 @@ impl Record {
     }
 }
 
-/// The record with its own checksum: a flipped digit in a number would still be JSON.
+/// A record, or a list of edits, with its own checksum: a flipped digit in a number would still be
+/// JSON.
 #[derive(Serialize, Deserialize)]
 struct Sealed {
     sha256: String,
@@ -87,16 +88,25 @@ struct Sealed {
 }
 
 pub(super) fn seal(record: &Record) -> serde_json::Result<Vec<u8>> {
-    let record = serde_json::to_string(record)?;
+    seal_text(serde_json::to_string(record)?)
+}
+
+/// A text with its checksum.
+pub(super) fn seal_text(record: String) -> serde_json::Result<Vec<u8>> {
     serde_json::to_vec(&Sealed { sha256: hex(&Sha256::digest(&record)), record })
 }
 
 pub(super) fn unseal(file: &[u8]) -> Result<Record> {
-    let corrupt =
-        |why: String| Error::new(ErrorCode::SceneCorrupt, format!("the scene's status: {why}"));
+    let what = "the scene's status";
+    serde_json::from_str(&unseal_text(file, what)?).map_err(|e| unread_json(what, &e))
+}
+
+/// The text of a sealed file; `what` names it in the error `scene_corrupt`.
+pub(super) fn unseal_text(file: &[u8], what: &str) -> Result<String> {
+    let corrupt = |why: String| Error::new(ErrorCode::SceneCorrupt, format!("{what}: {why}"));
     let sealed: Sealed = serde_json::from_slice(file).map_err(|e| corrupt(e.to_string()))?;
     if sealed.sha256 != hex(&Sha256::digest(&sealed.record)) {
         return Err(corrupt("its checksum does not match its content".to_owned()));
     }
-    serde_json::from_str(&sealed.record).map_err(|e| unread_json("the scene's status", &e))
+    Ok(sealed.record)
 }

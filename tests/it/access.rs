@@ -20,12 +20,14 @@ use crate::common::{
 };
 
 /// Every call, named as the gRPC methods are, and what it needs.
-const CALLS: [(&str, Scope); 13] = [
+const CALLS: [(&str, Scope); 15] = [
     ("CreateScene", Scope::Write),
     ("ListScenes", Scope::Read),
     ("GetScene", Scope::Read),
     ("WatchScene", Scope::Read),
     ("RefineScene", Scope::Write),
+    ("GetEdits", Scope::Read),
+    ("SetEdits", Scope::Write),
     ("RenderView", Scope::Read),
     ("RenderViews", Scope::Read),
     ("Query", Scope::Read),
@@ -91,6 +93,10 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
                 "RenderViews" => client
                     .post(format!("{base}/v1/scenes/{id}/views"))
                     .body("{\"cameras\":[{\"from\":0}],\"width\":32,\"height\":24}"),
+                "GetEdits" => client.get(format!("{base}/v1/scenes/{id}/edits")),
+                "SetEdits" => {
+                    client.put(format!("{base}/v1/scenes/{id}/edits")).body("{\"edits\":[]}")
+                }
                 "RefineScene" => client.post(format!("{base}/v1/scenes/{id}/refine?refine=off")),
                 other => panic!("{other} is not a call"),
             };
@@ -116,6 +122,12 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
                 "RefineScene" => {
                     let off = pb::RefineSceneRequest { scene_id, refine: "off".to_owned() };
                     client.refine_scene(off).await.map(drop)
+                }
+                "GetEdits" => client.get_edits(pb::GetEditsRequest { scene_id }).await.map(drop),
+                "SetEdits" => {
+                    let edits_json = "[]".into();
+                    let none = pb::SetEditsRequest { scene_id, edits_json, ..Default::default() };
+                    client.set_edits(none).await.map(drop)
                 }
                 "RenderViews" => {
                     let cameras = vec![camera];

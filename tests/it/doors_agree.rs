@@ -16,12 +16,13 @@ use crate::common::{cpu_server::CpuServer, root};
 type Absent = &'static [(&'static str, &'static str)];
 
 /// Calls on the command line, and its commands.
-const COMMANDS: [(&str, &str); 6] = [
+const COMMANDS: [(&str, &str); 7] = [
     ("create_scene", "reconstruct"),
     ("render_view", "render"),
     ("query", "query"),
     ("features", "features"),
     ("export", "export"),
+    ("set_edits", "edit"),
     ("models", "models"),
 ];
 
@@ -32,6 +33,7 @@ const NOT_IN_GRPC: Absent = &[
     ("create_scene.masks", "a `photo` of the name `masks/PHOTO.png`"),
     ("create_scene.transforms", "`transforms_json`"),
     ("pick.label", "`labels`"),
+    ("set_edits.edits", "`edits_json`"),
     ("render_views.container", "a stream of views"),
     ("Scene.depth_range", "`depth_near` and `depth_far`"),
     ("Scene.network", "the lens of pixels that only a PLY names"),
@@ -43,6 +45,7 @@ const NOT_ON_THE_COMMAND_LINE: Absent = &[
     ("get_scene", "`inspect` shows a file"),
     ("delete_scene", "it works on files"),
     ("watch_scene", "`reconstruct` shows its progress"),
+    ("get_edits", "a file has no list: `edit` writes what it comes to"),
     ("refine_scene", "`reconstruct --refine`: a file has no photos"),
     ("render_views", "a call of `render` for each camera"),
     ("pick", "a pixel is named by whoever looks at a picture: the page, a program"),
@@ -63,6 +66,8 @@ const NOT_ON_THE_COMMAND_LINE: Absent = &[
 ];
 
 const NOT_ON_THE_PAGE: Absent = &[
+    ("get_edits", "the list of edits comes with the page that is being made anew"),
+    ("set_edits", "the list of edits comes with the page that is being made anew"),
     ("refine_scene", "it takes the machine for minutes: an operator or a program asks for it"),
     ("render_view.*", "a small picture of what a photo shows, as the server draws it"),
     ("render_views", "the page draws the scene itself"),

@@ -60,10 +60,12 @@ enum Ask {
     Text,
     FirstText,
     Refine,
+    /// Sends two edits.
+    Edits,
 }
 
 /// Limits, a value of each that changes the answer, and what is asked.
-const LIVE: [(&str, u64, Ask); 35] = [
+const LIVE: [(&str, u64, Ask); 36] = [
     ("photos_max", 2, Ask::Photos),
     ("photos_min", 4, Ask::Photos),
     ("upload_bytes_max", 1_000, Ask::Photos),
@@ -91,6 +93,7 @@ const LIVE: [(&str, u64, Ask); 35] = [
     ("kinds_max", 1, Ask::Views),
     ("views_pixels_max", 10, Ask::Views),
     ("views_timeout_ms", 0, Ask::Views),
+    ("edits_max", 1, Ask::Edits),
     ("texts_max", 1, Ask::Text),
     ("text_chars_max", 3, Ask::Text),
     ("parts_max", 0, Ask::Text),
@@ -219,6 +222,13 @@ impl Asked {
                 self.meaning.hold.store(false, Ordering::Release);
                 self.server.service.delete(&id).await.unwrap();
                 format!("answered: {}", answer.is_ok())
+            }
+            Ask::Edits => {
+                let ball = json!({ "center": [1e6, 0, 0], "radius": 1 });
+                let edit = json!({ "op": "delete", "select": { "sphere": ball } });
+                let request = client.put(url(&format!("/v1/scenes/{id}/edits")));
+                let request = request.json(&json!({ "edits": [edit, edit] }));
+                request.send().await.unwrap().status().to_string()
             }
             Ask::Refine => {
                 let (_, scene) = self.created(&six_photos(), 60_000).await;

@@ -20,6 +20,7 @@ mod common;
 mod containers;
 mod crop;
 mod doors_agree;
+mod edits;
 mod errors;
 mod faults;
 mod fields;

@@ -26,6 +26,8 @@ METHODS = {
     "delete_scene": (Scene, AsyncScene, "delete"),
     "watch_scene": (Scene, AsyncScene, "events"),
     "refine_scene": (Scene, AsyncScene, "refine"),
+    "get_edits": (Scene, AsyncScene, "edits"),
+    "set_edits": (Scene, AsyncScene, "set_edits"),
     "render_view": (Scene, AsyncScene, "view"),
     "render_views": (Scene, AsyncScene, "views"),
     "query": (Scene, AsyncScene, "query"),

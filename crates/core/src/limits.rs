@@ -111,6 +111,8 @@ limits! {
     kinds_max: usize = 8;
     /// Texts in one `query` request, and labels in one `pick`.
     texts_max: usize = 128;
+    /// Edits of one scene, applied one after the other when it is loaded.
+    edits_max: usize = 256;
     /// Characters of one text: more than any noun phrase needs.
     text_chars_max: usize = 256;
     /// Milliseconds a text waits for semantics that are being made, unless it says how long.
@@ -161,6 +163,8 @@ limits! {
     inferences_max: usize = 8, restart;
     /// Bytes of scenes kept in memory.
     cache_bytes_max: u64 = 4 << 30, restart;
+    /// Bytes of edited scenes kept in memory, beside `cache_bytes_max` for those without edits.
+    edited_cache_bytes_max: u64 = 2 << 30, restart;
     /// Bytes of scenes kept on one GPU device: what a card of 8 GB has to spare beside its frames.
     device_scene_bytes_max: u64 = 2 << 30, restart;
     /// Milliseconds in which the head of a request must come, from the connection's start or the

@@ -15,9 +15,9 @@ use crate::{
         FeatureKind, FeaturesSpec, Format, InstanceBox, KnownWord, Label, LensSpec, MaskFormat,
         MaskLevel, MaxError, Method, ModelInfo, ModelsInfo, Peak, PickSpec, Picked, PictureKind,
         PictureOptions, PoseSpec, Preset, QueryAnswer, QuerySpec, RenderedView, SceneCamera,
-        SceneError, SceneOptions, SceneState, SceneStatus, ScoringOptions, SemanticsMode,
-        SemanticsState, SemanticsStatus, TextOptions, TextResult, TextView, TextWarning, Trust,
-        ViewOptions,
+        SceneEdits, SceneError, SceneOptions, SceneState, SceneStatus, ScoringOptions,
+        SemanticsMode, SemanticsState, SemanticsStatus, TextOptions, TextResult, TextView,
+        TextWarning, Trust, ViewOptions,
     },
 };
 
@@ -26,6 +26,13 @@ macro_rules! message {
     ($message:ident from $from:ident { $($same:ident),+ } $($other:tt)*) => {
         pb::$message { $($same: $from.$same,)+ $($other)* }
     };
+}
+
+/// Edits and what they come to.
+pub(super) fn edits(found: SceneEdits) -> Result<pb::SceneEdits> {
+    let edits_json = serde_json::to_string(&found.edits)
+        .map_err(|e| Error::internal("the edits cannot be written").caused_by(e))?;
+    Ok(pb::SceneEdits { edits_json, counts: found.counts, gaussians: found.gaussians })
 }
 
 /// A scene and its semantics.

@@ -112,6 +112,25 @@ impl pb::scene_service_server::SceneService for Api {
         .await
     }
 
+    async fn get_edits(&self, request: Request<pb::GetEditsRequest>) -> Answer<pb::SceneEdits> {
+        answer(self, request, |api, request| async move {
+            convert::edits(api.service.edits(&request.scene_id.parse()?).await?)
+        })
+        .await
+    }
+
+    async fn set_edits(&self, request: Request<pb::SetEditsRequest>) -> Answer<pb::SceneEdits> {
+        answer(self, request, |api, request| async move {
+            let id = request.scene_id.parse()?;
+            api.service.limits().check_json("edits_json", &request.edits_json)?;
+            let edits = serde_json::from_slice(&request.edits_json)
+                .map_err(|e| Error::invalid(format!("edits_json: {e}")).caused_by(e))?;
+            let wait = request.semantics_wait_ms.map(Duration::from_millis);
+            convert::edits(api.service.set_edits(&id, edits, wait).await?)
+        })
+        .await
+    }
+
     async fn render_view(&self, request: Request<pb::RenderViewRequest>) -> Answer<pb::View> {
         answer(self, request, render).await.map(timed).map(held)
     }

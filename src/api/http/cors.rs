@@ -43,7 +43,7 @@ pub(super) fn layer(origins: &[String]) -> Result<Option<CorsLayer>> {
         return Ok(None);
     }
     let rules = CorsLayer::new()
-        .allow_methods([Method::GET, Method::POST, Method::DELETE])
+        .allow_methods([Method::GET, Method::POST, Method::PUT, Method::DELETE])
         .allow_headers(ALLOWED)
         .expose_headers(EXPOSED)
         .max_age(MAX_AGE);

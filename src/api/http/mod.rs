@@ -6,6 +6,7 @@ mod answers;
 mod body;
 mod connection;
 mod cors;
+mod edits;
 mod error;
 mod extract;
 mod fields;
@@ -30,7 +31,7 @@ use axum::{
     Router,
     extract::DefaultBodyLimit,
     middleware::{from_fn, from_fn_with_state},
-    routing::{MethodRouter, delete, get, post},
+    routing::{MethodRouter, delete, get, post, put},
 };
 use tower_http::catch_panic::CatchPanicLayer;
 
@@ -74,6 +75,8 @@ pub fn routes() -> Vec<Route> {
         ("DELETE", "/v1/scenes/{id}", "delete_scene", write, delete(scenes::delete)),
         ("GET", "/v1/scenes/{id}/events", "watch_scene", read, get(scenes::events)),
         ("POST", "/v1/scenes/{id}/refine", "refine_scene", write, post(scenes::refine)),
+        ("GET", "/v1/scenes/{id}/edits", "get_edits", read, get(edits::get)),
+        ("PUT", "/v1/scenes/{id}/edits", "set_edits", write, put(edits::set)),
         ("GET", "/v1/scenes/{id}/view", "render_view", read, get(render::view)),
         ("POST", "/v1/scenes/{id}/views", "render_views", read, post(views::views)),
         ("POST", "/v1/scenes/{id}/query", "query", read, post(texts::query)),

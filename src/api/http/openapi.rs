@@ -15,6 +15,7 @@ use utoipa::{
 };
 
 use super::{
+    edits,
     error::{ErrorBody, PROBLEM, ProblemBody},
     health, inference, render, scenes, texts, viewer, views,
 };
@@ -29,7 +30,7 @@ use crate::{
 };
 
 /// Schemas of what callers send, whose fields have bounds. Those of answers have none.
-const SENT: [&str; 3] = ["CameraFields", "QueryBody", "ViewsRequest"];
+const SENT: [&str; 4] = ["CameraFields", "EditsBody", "QueryBody", "ViewsRequest"];
 
 /// This document
 #[utoipa::path(
@@ -48,6 +49,7 @@ pub(super) async fn document(State(api): State<Api>) -> Json<Value> {
     ),
     paths(
         scenes::create, scenes::list, scenes::get, scenes::delete, scenes::events, scenes::refine,
+        edits::get, edits::set,
         render::view, views::views, texts::query, texts::pick, render::export, render::features,
         health::models, health::live, health::ready, health::metrics, document, viewer::index,
         viewer::sample, inference::server_metadata, inference::server_live,
@@ -89,7 +91,7 @@ impl Modify for EveryCall {
             .schema(Some(<u64 as PartialSchema>::schema()))
             .build();
         for item in document.paths.paths.values_mut() {
-            let operations = [&mut item.get, &mut item.post, &mut item.delete];
+            let operations = [&mut item.get, &mut item.post, &mut item.put, &mut item.delete];
             for operation in operations.into_iter().flatten() {
                 operation.parameters.get_or_insert_default().push(RefOr::T(deadline.clone()));
                 let fault = RefOr::T(fault.clone());

@@ -396,6 +396,43 @@ def refine(scene: Handle, refine: Literal["auto", "off"] | int = "auto") -> Flow
     scene.shown = parse(SceneStatus, _json(answer.body)), scene.shown[1]
 
 
+# Edits
+
+
+def edits(scene: Handle) -> Flow[list[dict[str, Any]]]:
+    """The edits of the scene, in the order in which they are applied."""
+    answer = yield from send(scene.policy, Request("GET", f"/v1/scenes/{scene.id}/edits"))
+    listed: list[dict[str, Any]] = _json(answer.body)["edits"]
+    return listed
+
+
+def set_edits(scene: Handle, edits: Iterable[Mapping[str, Any]]) -> Flow[list[int]]:
+    """Puts a list of edits in place of the one before; an empty one brings every bit back. Gives
+    how many Gaussians each took. Views, answers and files show the edited scene.
+
+    edits: as `edit` takes them.
+    """
+    path, body = f"/v1/scenes/{scene.id}/edits", {"edits": [dict(edit) for edit in edits]}
+    answer = yield from send(scene.policy, Request("PUT", path, json=body))
+    counts: list[int] = _json(answer.body)["counts"]
+    return counts
+
+
+def edit(scene: Handle, *more: Mapping[str, Any]) -> Flow[list[int]]:
+    """Adds edits at the end of the list; gives how many Gaussians each of the list took.
+
+    more: `{"op": "delete", "select": {"text": "chair"}}`. The operations: delete, keep; move and
+        copy with translation, rotation (wxyz), scale and center; recolor with color and amount. A
+        selection is a text (and parts of it), a box, a sphere, or a pick.
+    """
+    return (yield from set_edits(scene, [*(yield from edits(scene)), *more]))
+
+
+def undo(scene: Handle) -> Flow[list[int]]:
+    """Takes the last edit back; gives how many Gaussians each of the others took."""
+    return (yield from set_edits(scene, (yield from edits(scene))[:-1]))
+
+
 # Views
 
 

@@ -73,10 +73,11 @@ METHOD = _POOL.FindMessageTypeByName("segsplat.v1.Method").fields_by_name.keys()
 def messages(step: Request) -> tuple[MethodDescriptor, Message | Iterator[Message]]:
     """The method of a request of HTTP, and what is sent to it."""
     *_, scenes, id, action = ["", "", *step.path.removeprefix("/v1/").split("/")][-3:]
+    edits = {"GET": "GetEdits", "PUT": "SetEdits"}.get(step.method) if action == "edits" else None
     if scenes != "scenes":
         id, action = action if id == "scenes" else "", "" if id == "scenes" else action
     name = "ListScenes" if action == "scenes" and step.method == "GET" else METHODS.get(action)
-    method = _SERVICE.methods_by_name[name or METHODS[step.method]]
+    method = _SERVICE.methods_by_name[edits or name or METHODS[step.method]]
     fields = {**step.params, **(step.json or {})}
     if method.name == "CreateScene":
         return method, _upload(method, step, fields)
@@ -140,6 +141,8 @@ def _nested(method: str, fields: dict[str, Any]) -> dict[str, Any]:
         rest["semantics_wait_ms"] = rest.pop("wait_ms")
     if scoring := {name: rest.pop(name) for name in SCORING if name in rest}:
         taken["scoring"] = scoring
+    if "edits" in rest:
+        rest["edits_json"] = json.dumps(rest.pop("edits")).encode()
     if method == "Export":
         rest["format"] = _enum("export_format", rest["format"])
         return {**rest, **taken, **{n: _enum(n, rest[n]) for n in ("preset",) if n in rest}}
@@ -258,6 +261,10 @@ def _event(fields: dict[str, Any]) -> dict[str, Any]:
     return {**fields, **(fields["error"] or {}), "event": event}
 
 
+def _edits(fields: dict[str, Any]) -> dict[str, Any]:
+    return {**fields, "edits": json.loads(fields["edits_json"])}
+
+
 def _found(fields: dict[str, Any]) -> dict[str, Any]:
     lens = fields["intrinsics"]
     if lens:
@@ -286,6 +293,7 @@ def _picture(view: Any) -> tuple[dict[str, str], bytes]:
 SHAPES: Mapping[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     **{"CreateScene": _scene, "GetScene": _scene, "RefineScene": _scene, "ListScenes": _page},
     **{"WatchScene": _event, "Query": _found, "Models": _models},
+    **{"GetEdits": _edits, "SetEdits": _edits},
 }
 
 

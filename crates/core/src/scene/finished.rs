@@ -64,6 +64,8 @@ pub struct Scene {
     pub sha256: String,
     /// sha256 of the file of its semantics, hex; empty where they are in none.
     pub semantics_sha256: String,
+    /// sha256 of the list of edits that its Gaussians have behind them, hex; empty where none.
+    pub edits_sha256: String,
 }
 
 impl Scene {
@@ -76,6 +78,7 @@ impl Scene {
             semantics: None,
             sha256: String::new(),
             semantics_sha256: String::new(),
+            edits_sha256: String::new(),
         }
     }
 
@@ -88,6 +91,17 @@ impl Scene {
                 + 12 * semantics.masks.len()
         });
         self.gaussians.size_bytes() + semantics as u64
+    }
+
+    /// The same scene with other Gaussians, which have entries of its bank, after the edits of
+    /// this hash.
+    #[must_use]
+    pub fn after_edits(&self, gaussians: Gaussians, edits_sha256: String) -> Self {
+        let semantics = self.semantics.as_ref().map(|semantics| {
+            let index = gaussians.semantic_index().to_vec();
+            Arc::new(Semantics { index, ..(**semantics).clone() })
+        });
+        Self { gaussians, semantics, edits_sha256, ..self.clone() }
     }
 
     /// The same scene; its Gaussians have the entries of `semantics`.

@@ -52,7 +52,7 @@ pub struct RawGaussians {
 
 impl RawGaussians {
     /// Coefficients a Gaussian: (degree + 1)².
-    fn sh_count(&self) -> usize {
+    pub(super) fn sh_count(&self) -> usize {
         (usize::from(self.sh_degree) + 1).pow(2)
     }
 
@@ -87,8 +87,19 @@ impl RawGaussians {
         self.source.push(from.source[i]);
     }
 
+    /// Adds Gaussians of the same origin and degree.
+    pub(super) fn append(&mut self, more: Self) {
+        self.means.extend(more.means);
+        self.quats.extend(more.quats);
+        self.scales.extend(more.scales);
+        self.opacities.extend(more.opacities);
+        self.sh.extend(more.sh);
+        self.semantic_index.extend(more.semantic_index);
+        self.source.extend(more.source);
+    }
+
     /// The Gaussians whose number `keep` takes, in their order.
-    fn only(&self, keep: impl Fn(usize) -> bool) -> Self {
+    pub(super) fn only(&self, keep: impl Fn(usize) -> bool) -> Self {
         let mut some = self.emptied();
         (0..self.means.len()).filter(|&i| keep(i)).for_each(|i| some.push(self, i));
         some
@@ -279,13 +290,8 @@ impl Gaussians {
         let more = more.clone().into_raw();
         let centre =
             |mean: [f32; 3]| (DVec3::from(mean.map(f64::from)) + offset).as_vec3().to_array();
-        all.means.extend(more.means.into_iter().map(centre));
-        all.quats.extend(more.quats);
-        all.scales.extend(more.scales);
-        all.opacities.extend(more.opacities);
-        all.sh.extend(more.sh);
-        all.semantic_index.extend(more.semantic_index);
-        all.source.extend(more.source);
+        let means = more.means.into_iter().map(centre).collect();
+        all.append(RawGaussians { means, ..more });
         Self::restore(all)
     }
 

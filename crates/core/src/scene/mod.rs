@@ -7,6 +7,7 @@ mod backdrop;
 mod camera;
 mod cameras;
 mod capture;
+mod edits;
 mod failure;
 mod finished;
 mod gaussians;
@@ -17,6 +18,7 @@ mod photo;
 mod refinement;
 mod report;
 mod semantics;
+mod sh;
 mod stage;
 mod status;
 mod upload;
@@ -29,6 +31,7 @@ pub use cameras::{
     CameraUse, CamerasMode, CamerasReport, CamerasSource, LeftOutPhoto, PlacedPhoto, SolvedCamera,
 };
 pub use capture::{Capture, ViewSet};
+pub use edits::{Edit, EditAction, Edited, Editing, Place, Placement, Selected, edited};
 pub use failure::SceneError;
 pub use finished::{PhotoHash, Provenance, Scene, SceneMeta};
 pub use gaussians::{BLUR_PX2, Gaussians, RawGaussians, SH_C0, SanitizeReport, SourcePixel};
@@ -44,6 +47,7 @@ pub use semantics::{
     Bank, BankMask, DenseFeatures, IndexMap, JudgedMasks, MaskInfo, MaskJudging, MaskLogits,
     OverlapNms, PhotoMasks, RowViews, Semantics, SemanticsReport, TextEmbedding,
 };
+pub use sh::{SH_COUNT_MAX, ShRotation, sh_basis};
 pub use stage::{Stage, Watch, unless_cancelled};
 pub use status::{Event, SceneCamera, SceneState, SceneStatus, SemanticsState, SemanticsStatus};
 pub use upload::{Upload, UploadCameras, UploadFile};

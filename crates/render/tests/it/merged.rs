@@ -397,11 +397,7 @@ fn merged_gaussians_have_the_entry_with_most_opacity() {
     };
     for (at, &entry) in entries.iter().enumerate() {
         let mut sums = [0.0; 16];
-        merged
-            .group(at)
-            .iter()
-            .map(of)
-            .for_each(|(entry, sum)| sums[usize::from(entry)] += sum);
+        merged.group(at).iter().map(of).for_each(|(entry, sum)| sums[usize::from(entry)] += sum);
         let most = sums.iter().copied().fold(0.0, f32::max);
         assert!(sums[usize::from(entry)] >= most * 0.999_99, "{at}: {entry} of {sums:?}");
     }

@@ -6,7 +6,6 @@
 
 mod backdrop;
 mod fuse;
-mod sh;
 mod thin;
 mod union;
 
@@ -21,13 +20,12 @@ use crate::{
     error::{Error, Result},
     lift::{
         fuse::{Fate, fuse},
-        sh::ShRotation,
         union::{PIXELS_A_TASK, median, unite},
     },
     point,
     scene::{
-        Camera, DropCount, Gaussians, Intrinsics, RawGaussians, SourcePixel, ViewGaussians,
-        unless_cancelled,
+        Camera, DropCount, Gaussians, Intrinsics, RawGaussians, ShRotation, SourcePixel,
+        ViewGaussians, unless_cancelled,
     },
 };
 

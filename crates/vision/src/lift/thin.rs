@@ -10,10 +10,10 @@
 use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 
-use super::{fuse::Fate, sh::COUNT_MAX as SH_COUNT_MAX};
+use super::fuse::Fate;
 use crate::{
     point,
-    scene::{BLUR_PX2, SH_C0, ViewGaussians, covariance, principal_axes},
+    scene::{BLUR_PX2, SH_C0, SH_COUNT_MAX, ViewGaussians, covariance, principal_axes},
 };
 
 /// How alike neighbours must be, and how often blocks of blocks are tried.

@@ -7,7 +7,7 @@
 use glam::{DMat3, DVec3};
 
 /// Coefficients of degree 3.
-pub(super) const COUNT_MAX: usize = 16;
+pub const SH_COUNT_MAX: usize = 16;
 /// Gauss-Legendre nodes and weights, order 4: exact to degree 7.
 const NODES: [(f64, f64); 4] = [
     (-0.861_136_311_594_052_6, 0.347_854_845_137_453_86),
@@ -19,7 +19,8 @@ const NODES: [(f64, f64); 4] = [
 const STEPS: usize = 8;
 
 /// The real orthonormal basis at unit direction `d`, with 3DGS's signs.
-pub(super) fn basis(d: DVec3) -> [f64; COUNT_MAX] {
+#[must_use]
+pub fn sh_basis(d: DVec3) -> [f64; SH_COUNT_MAX] {
     let (x, y, z) = (d.x, d.y, d.z);
     let (xx, yy, zz) = (x * x, y * y, z * z);
     [
@@ -44,22 +45,23 @@ pub(super) fn basis(d: DVec3) -> [f64; COUNT_MAX] {
 
 /// Rotates coefficients of functions on the sphere: `f'(d) = f(R⁻¹ d)`.
 #[derive(Clone, Debug)]
-pub(super) struct ShRotation {
-    matrix: [[f64; COUNT_MAX]; COUNT_MAX],
+pub struct ShRotation {
+    matrix: [[f64; SH_COUNT_MAX]; SH_COUNT_MAX],
     degree: u8,
 }
 
 impl ShRotation {
     /// The rotation of functions by `rotation`, up to `degree` (3 at most).
-    pub(super) fn new(rotation: DMat3, degree: u8) -> Self {
+    #[must_use]
+    pub fn new(rotation: DMat3, degree: u8) -> Self {
         let back = rotation.transpose();
-        let mut matrix = [[0.0; COUNT_MAX]; COUNT_MAX];
+        let mut matrix = [[0.0; SH_COUNT_MAX]; SH_COUNT_MAX];
         for (z, weight) in NODES {
             let r = (1.0 - z * z).sqrt();
             for step in 0..STEPS {
                 let phi = std::f64::consts::TAU * step as f64 / STEPS as f64;
                 let d = DVec3::new(r * phi.cos(), r * phi.sin(), z);
-                let (here, there) = (basis(d), basis(back * d));
+                let (here, there) = (sh_basis(d), sh_basis(back * d));
                 let w = weight * std::f64::consts::TAU / STEPS as f64;
                 for (row, yi) in matrix.iter_mut().zip(here) {
                     for (m, yj) in row.iter_mut().zip(there) {
@@ -72,8 +74,7 @@ impl ShRotation {
     }
 
     /// Rotates one Gaussian's coefficients, `[K, 3]`, in place.
-    #[expect(clippy::cast_possible_truncation, reason = "coefficients are f32")]
-    pub(super) fn apply(&self, sh: &mut [[f32; 3]]) {
+    pub fn apply(&self, sh: &mut [[f32; 3]]) {
         for band in 1..=usize::from(self.degree) {
             let range = band * band..(band + 1) * (band + 1);
             let mut old = [[0.0_f64; 3]; 7];
@@ -110,7 +111,7 @@ mod tests {
             for d in [DVec3::X, DVec3::new(1.0, 2.0, -0.5), DVec3::new(-0.2, 0.4, 3.0)] {
                 let d = d.normalize();
                 let value = |sh: &[[f32; 3]], d: DVec3| -> f64 {
-                    basis(d).iter().zip(sh).map(|(y, c)| y * f64::from(c[1])).sum()
+                    sh_basis(d).iter().zip(sh).map(|(y, c)| y * f64::from(c[1])).sum()
                 };
                 let (a, b) = (value(&before, d), value(&after, rotation * d));
                 assert!((a - b).abs() < 1e-6, "degree {degree}: {a} is not {b}");

@@ -1,0 +1,154 @@
+//! From what callers ask for to edits of Gaussians: texts become entries of the bank, parts and
+//! picks become entries and a box.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use super::spec::{Asked, EditSpec};
+use crate::{
+    error::{Error, ErrorCode, Result},
+    limits::Limits,
+    scene::{Edit, Editing, Gaussians, Place, Scene, Selected},
+    semantics::{Components, Instance, InstanceOptions},
+    service::{
+        pick,
+        search::{Backend, SceneTexts, ScoringChoice, SemanticScene},
+        texts,
+    },
+};
+
+/// How much larger than its Gaussians the box of a part is: what a version may move them by.
+const PART_SLACK: f64 = 1e-3;
+
+/// Edits that are ready to be applied, and the Gaussians that each took.
+#[derive(Debug)]
+pub(super) struct ResolvedEdits {
+    pub(super) edits: Vec<Edit>,
+    pub(super) counts: Vec<u64>,
+    pub(super) gaussians: Gaussians,
+}
+
+/// Checks a list of edits; nothing is made for it.
+pub(super) fn check(specs: &[EditSpec], limits: &Limits) -> Result<()> {
+    if specs.len() > limits.edits_max {
+        return Err(Error::limit("edits", specs.len(), limits.edits_max));
+    }
+    for (i, spec) in specs.iter().enumerate() {
+        let at = format!("edits[{i}]");
+        spec.action(&at)?;
+        spec.asked(&at, limits)?;
+    }
+    Ok(())
+}
+
+/// Resolves checked edits on a scene that has none, one after the other. Blocks.
+pub(super) fn resolve(
+    backend: &Arc<Backend>,
+    limits: &Limits,
+    base: &Arc<Scene>,
+    specs: &[EditSpec],
+) -> Result<ResolvedEdits> {
+    let mut editing = Editing::new(&base.gaussians, limits.gaussians_max);
+    let (mut edits, mut counts) = (Vec::new(), Vec::new());
+    for (i, spec) in specs.iter().enumerate() {
+        let at = format!("edits[{i}]");
+        let of = match spec.asked(&at, limits)? {
+            Asked::Place(place) => Selected { entries: None, within: vec![place] },
+            Asked::Text { text, parts, scoring } => {
+                let how = ScoringChoice { preset: None, changes: scoring };
+                let scored = SceneTexts::new(backend, semantic(base, &at)?, &how, &[text], None)?;
+                let entries = scored.texts.first().map_or_else(Vec::new, |text| text.selected());
+                let within = match parts {
+                    None => Vec::new(),
+                    Some(parts) => {
+                        let now = base.after_edits(editing.gaussians()?, String::new());
+                        part_boxes(&scored, &now, &entries, &parts, limits, &at)?
+                    }
+                };
+                Selected { entries: Some(entries), within }
+            }
+            Asked::Pick(asked) => {
+                let now = semantic(base, &at)?.scene;
+                let now = now.after_edits(editing.gaussians()?, String::new());
+                let named =
+                    |e: Error| Error::new(e.code(), format!("{at}.select.pick: {}", e.message()));
+                let view = pick::pick_view(limits, &now, &asked).map_err(named)?;
+                let picked = pick::pick(&now, &view, [asked.x, asked.y]).map_err(named)?;
+                let (Some(number), Some(entry)) = (picked.gaussian, picked.entry) else {
+                    let why = "nothing with a label is at this pixel";
+                    return Err(named(Error::invalid(why)));
+                };
+                let all = InstanceOptions { count_min: 1, share_min: 0.0, ..Default::default() };
+                let found = instances(&now, &[entry], &all);
+                let holds =
+                    |part: &&Instance| part.gaussians.iter().any(|&i| u64::from(i) == number);
+                let within = found.iter().find(holds).map(|part| box_of(part, &now.gaussians));
+                Selected { entries: Some(vec![entry]), within: within.into_iter().collect() }
+            }
+        };
+        let edit = Edit { action: spec.action(&at)?, of };
+        let named = |e: Error| Error::new(e.code(), format!("{at}: {}", e.message()));
+        counts.push(editing.apply(&edit).map_err(named)?);
+        edits.push(edit);
+        if editing.is_empty() {
+            return Err(Error::invalid(format!("{at} leaves nothing of the scene")));
+        }
+    }
+    Ok(ResolvedEdits { edits, counts, gaussians: editing.gaussians()? })
+}
+
+fn semantic(base: &Arc<Scene>, at: &str) -> Result<SemanticScene> {
+    SemanticScene::new(Arc::clone(base)).ok_or_else(|| {
+        let why = format!("{at}.select needs the scene's semantics, which are not ready");
+        Error::new(ErrorCode::SceneNotReady, why)
+    })
+}
+
+fn instances(now: &Scene, entries: &[u16], options: &InstanceOptions) -> Vec<Instance> {
+    let components = Components::new(&now.gaussians, &now.meta.cameras, options);
+    components.instances(&now.gaussians, entries, options)
+}
+
+/// The boxes of these parts of what a text selects, in the order that a query gives them.
+fn part_boxes(
+    scored: &SceneTexts,
+    now: &Scene,
+    entries: &[u16],
+    parts: &[u32],
+    limits: &Limits,
+    at: &str,
+) -> Result<Vec<Place>> {
+    texts::check_count("parts", parts.len(), limits.parts_max)?;
+    let mut found = instances(now, entries, &InstanceOptions::default());
+    found.truncate(limits.parts_max);
+    let relevancies = scored.texts.first().map_or(&[][..], |text| text.scores.relevancies());
+    found.sort_by(|a, b| b.score(relevancies).total_cmp(&a.score(relevancies)));
+    let place = |part: &u32| match found.get(*part as usize) {
+        Some(instance) => Ok(box_of(instance, &now.gaussians)),
+        None => {
+            let has = format!("the text has {} parts", found.len());
+            Err(Error::invalid(format!("{at}.select.parts has {part}; {has}, counted from 0")))
+        }
+    };
+    parts.iter().map(place).collect()
+}
+
+/// The box along the axes of a part that holds the centres of all its Gaussians.
+fn box_of(part: &Instance, gaussians: &Gaussians) -> Place {
+    let axes = part.oriented().axes;
+    let mut bounds = axes.map(|_| [f64::INFINITY, f64::NEG_INFINITY]);
+    for &i in &part.gaussians {
+        let mean = gaussians.means()[i as usize].map(f64::from);
+        let point = DVec3::from(mean) + gaussians.origin();
+        for (axis, [least, most]) in axes.iter().zip(&mut bounds) {
+            let along = DVec3::from(*axis).dot(point);
+            (*least, *most) = (least.min(along), most.max(along));
+        }
+    }
+    let sides = axes.iter().zip(&bounds);
+    let center: DVec3 = sides.map(|(axis, [a, b])| DVec3::from(*axis) * (0.5 * (a + b))).sum();
+    let longest = bounds.iter().map(|[a, b]| b - a).fold(0.0, f64::max);
+    let size = bounds.map(|[a, b]| b - a + PART_SLACK * longest);
+    Place::Box { center: center.to_array(), size, axes }
+}

@@ -1,0 +1,30 @@
+//! The list of edits of a scene, in an object of its own: any replica may replace it while another
+//! one writes the record.
+//!
+//! The store does not read the list. A bad one stays where it is until another takes its place:
+//! without it a scene would show what was deleted.
+
+use super::{EDITS, Store, of, record};
+use crate::{
+    error::{Error, Result},
+    scene::SceneId,
+};
+
+impl Store {
+    /// The list of edits that is kept of a scene, as it was given.
+    /// Fails with `scene_corrupt` and `store_unavailable`.
+    pub(crate) fn edits(&self, id: &SceneId) -> Result<Option<String>> {
+        let file = self.objects.get("read the scene's edits", of(id, EDITS))?;
+        let what = || format!("the edits of scene {id}");
+        file.map(|file| record::unseal_text(&file, &what())).transpose()
+    }
+
+    /// Keeps a list of edits in place of the one before.
+    /// Fails with `store_unavailable`; `scene_not_found` when the scene was deleted.
+    pub(crate) fn put_edits(&self, id: &SceneId, edits: String) -> Result<()> {
+        let sealed = record::seal_text(edits)
+            .map_err(|e| Error::internal("the edits cannot be written").caused_by(e))?;
+        self.objects.put("keep the scene's edits", of(id, EDITS), sealed)?;
+        self.unless_deleted(id)
+    }
+}
