@@ -42,7 +42,8 @@ pub(super) fn edits_tag(base: &Scene, edits_sha256: &str) -> String {
     tag(&base.sha256, &base.meta.id, edits_sha256, &base.semantics_sha256)
 }
 
-/// The tag of the version that a record names, after the edits of a list of this hash. Others may be served a moment later.
+/// The tag of the version that a record names, after the edits of a list of this hash. Others may
+/// be served a moment later.
 pub(super) fn record_tag(record: &Record, edits_sha256: &str) -> String {
     let [scene, semantics] =
         [&record.scene_sha256, &record.semantics_sha256].map(|of| of.as_deref().unwrap_or(""));

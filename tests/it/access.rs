@@ -257,6 +257,7 @@ fn every_call_of_both_doors_has_its_scope_in_the_table() {
         "POST /v1/scenes",
         "DELETE /v1/scenes/{id}",
         "POST /v1/scenes/{id}/refine",
+        "PUT /v1/scenes/{id}/edits",
         "POST /v2/models/{name}/infer",
     ];
     assert_eq!(writes, want);

@@ -22,8 +22,8 @@ pub(crate) fn corners(places: &[Place]) -> [[f32; 3]; 2] {
     [low.to_array(), high.to_array()]
 }
 
-/// Orders places so that blocks of `size` of them are close together, and neighbouring blocks mostly
-/// are.
+/// Orders places so that blocks of `size` of them are close together, and neighbouring blocks
+/// mostly are.
 pub(crate) fn split(places: &mut [Place], size: usize) {
     if places.len() <= size {
         return places.sort_unstable_by_key(|place| place.id);

@@ -46,8 +46,8 @@ impl View {
     ///
     /// # Errors
     /// `invalid_request` when the intrinsics are unusable, the near plane is not a finite number
-    /// over 0, the error or the detail is out of range, or background, sources or labels are not finite;
-    /// `limit_exceeded` for a picture beyond memory.
+    /// over 0, the error or the detail is out of range, or background, sources or labels are not
+    /// finite; `limit_exceeded` for a picture beyond memory.
     pub fn new(origin: DVec3, request: &RenderRequest) -> Result<Self> {
         let lens = request.camera.intrinsics.validated("camera")?;
         let cropped = match request.crop {
