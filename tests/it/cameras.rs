@@ -3,6 +3,7 @@
 
 use std::{
     path::Path,
+    sync::LazyLock,
     time::{Duration, Instant},
 };
 
@@ -29,11 +30,24 @@ fn server(data: &Path) -> Process {
     Start::on(data).bundle("../../models/embedded").start()
 }
 
-/// Photos of a generated room, and their cameras.
-fn room(photos: usize, seed: u64) -> (Vec<UploadFile>, Vec<Camera>) {
+type Room = (Vec<UploadFile>, Vec<Camera>);
+
+fn generated(photos: usize, seed: u64) -> Room {
     let options = SampleOptions { photos, width: 480, height: 360, seed };
     let files = sample::upload(&options).unwrap().photos;
     (files, sample::cameras(&options).unwrap())
+}
+
+/// Eight photos of a generated room, and their cameras: drawn once, which takes seconds.
+fn room() -> Room {
+    static ROOM: LazyLock<Room> = LazyLock::new(|| generated(8, 1));
+    ROOM.clone()
+}
+
+/// A photo of another room.
+fn stranger(name: &str) -> UploadFile {
+    static STRANGER: LazyLock<Room> = LazyLock::new(|| generated(2, 40));
+    UploadFile { name: name.to_owned(), ..STRANGER.0[0].clone() }
 }
 
 fn upload(photos: Vec<UploadFile>) -> Upload {
@@ -93,9 +107,8 @@ async fn photos_alone_become_a_scene_and_a_photo_of_another_place_is_named() {
     }
     let data = tempfile::tempdir().unwrap();
     let server = server(data.path());
-    let (mut photos, truth) = room(8, 1);
-    let stranger = room(2, 40).0.remove(0);
-    photos.push(UploadFile { name: "images/stranger.png".to_owned(), ..stranger });
+    let (mut photos, truth) = room();
+    photos.push(stranger("images/stranger.png"));
     let status = made(&server, photos).await;
     assert_eq!(status["state"], "done", "{status}");
     let report = &status["report"]["cameras"];
@@ -136,7 +149,7 @@ async fn photos_that_cannot_be_solved_are_refused_with_what_to_do() {
     }
     let data = tempfile::tempdir().unwrap();
     let server = server(data.path());
-    let (photos, _) = room(2, 1);
+    let (photos, _) = room();
     let one = made(&server, photos[..1].to_vec()).await;
     assert_eq!(one["code"], "invalid_request", "{one}");
     assert!(one["message"].as_str().unwrap().contains("1 photo"), "{one}");
@@ -146,10 +159,7 @@ async fn photos_that_cannot_be_solved_are_refused_with_what_to_do() {
     picture.write_to(&mut std::io::Cursor::new(&mut plain), image::ImageFormat::Png).unwrap();
     let plain = (0..4).map(|i| UploadFile { name: format!("{i}.png"), bytes: plain.clone() });
     // Two places.
-    let strangers = [
-        room(2, 1).0.remove(0),
-        UploadFile { name: "other.png".to_owned(), ..room(2, 40).0.remove(0) },
-    ];
+    let strangers = [photos[0].clone(), stranger("other.png")];
     for (photos, named) in
         [(plain.collect::<Vec<_>>(), "0.png"), (strangers.into(), "nothing confirms their cameras")]
     {
@@ -169,7 +179,7 @@ async fn cameras_that_are_wrong_are_solved_where_that_is_asked() {
     }
     let data = tempfile::tempdir().unwrap();
     let server = server(data.path());
-    let (photos, truth) = room(8, 1);
+    let (photos, truth) = room();
     // Each photo has the camera of another.
     let wrong = truth.iter().rev().zip(&photos).map(|(camera, file)| {
         json!({
@@ -203,7 +213,7 @@ async fn a_job_that_finds_cameras_is_resumed_after_a_kill_and_can_be_cancelled()
     }
     let data = tempfile::tempdir().unwrap();
     let mut server = server(data.path());
-    let photos = room(7, 1).0;
+    let photos = room().0;
     let client = client();
     let begin = async |server: &Process| {
         let base = server.url("");
