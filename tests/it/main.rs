@@ -11,7 +11,6 @@ mod access;
 mod answers;
 mod asking;
 mod bad_input;
-mod cameras;
 mod captures;
 mod cli;
 mod colour_words;
