@@ -7,10 +7,10 @@
     reason = "helpers of tests are tests too"
 )]
 
+mod cameras;
 #[path = "../it/common/mod.rs"]
 #[allow(unused_imports, reason = "the quick tests use the rest")]
 mod common;
-mod cameras;
 mod conventions;
 mod fuzz_input;
 mod kill;
