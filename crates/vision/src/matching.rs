@@ -66,8 +66,11 @@ impl Descriptors {
     fn most_similar(&self, other: &Self) -> [MostSimilar; 2] {
         let mut of_these = MostSimilar::none(self.count());
         let mut of_others = MostSimilar::none(0);
+        if self.count() == 0 {
+            return [of_these, of_others];
+        }
         let mut cosines = DMatrix::zeros(self.count(), TOGETHER);
-        for first in (0..other.count()).step_by(TOGETHER).filter(|_| self.count() > 0) {
+        for first in (0..other.count()).step_by(TOGETHER) {
             let columns = other.columns.columns(first, TOGETHER.min(other.count() - first));
             cosines.columns_mut(0, columns.ncols()).gemm(1.0, &self.rows, &columns, 0.0);
             let each = cosines.as_slice().chunks_exact(self.count()).take(columns.ncols());

@@ -13,6 +13,7 @@ use crate::{
     semantics::{Components, Instance, InstanceOptions},
     service::{
         pick,
+        request::PickSpec,
         search::{Backend, SceneTexts, ScoringChoice, SemanticScene},
         texts,
     },
@@ -58,44 +59,62 @@ pub(super) fn resolve(
             Asked::Text { text, parts, scoring } => {
                 let how = ScoringChoice { preset: None, changes: scoring };
                 let scored = SceneTexts::new(backend, semantic(base, &at)?, &how, &[text], None)?;
-                let entries = scored.texts.first().map_or_else(Vec::new, |text| text.selected());
-                let within = match parts {
-                    None => Vec::new(),
-                    Some(parts) => {
-                        let now = base.after_edits(editing.gaussians()?, String::new());
-                        part_boxes(&scored, &now, &entries, &parts, limits, &at)?
-                    }
-                };
-                Selected { entries: Some(entries), within }
+                of_text(&scored, base, &editing, parts.as_deref(), limits, &at)?
             }
             Asked::Pick(asked) => {
                 let now = semantic(base, &at)?.scene;
                 let now = now.after_edits(editing.gaussians()?, String::new());
-                let named =
-                    |e: Error| Error::new(e.code(), format!("{at}.select.pick: {}", e.message()));
-                let view = pick::pick_view(limits, &now, &asked).map_err(named)?;
-                let picked = pick::pick(&now, &view, [asked.x, asked.y]).map_err(named)?;
-                let (Some(number), Some(entry)) = (picked.gaussian, picked.entry) else {
-                    let why = "nothing with a label is at this pixel";
-                    return Err(named(Error::invalid(why)));
-                };
-                let all = InstanceOptions { count_min: 1, share_min: 0.0, ..Default::default() };
-                let found = instances(&now, &[entry], &all);
-                let holds =
-                    |part: &&Instance| part.gaussians.iter().any(|&i| u64::from(i) == number);
-                let within = found.iter().find(holds).map(|part| box_of(part, &now.gaussians));
-                Selected { entries: Some(vec![entry]), within: within.into_iter().collect() }
+                of_pick(&now, &asked, limits)
+                    .map_err(|e| named(&e, &format!("{at}.select.pick")))?
             }
         };
         let edit = Edit { action: spec.action(&at)?, of };
-        let named = |e: Error| Error::new(e.code(), format!("{at}: {}", e.message()));
-        counts.push(editing.apply(&edit).map_err(named)?);
+        counts.push(editing.apply(&edit).map_err(|e| named(&e, &at))?);
         edits.push(edit);
         if editing.is_empty() {
             return Err(Error::invalid(format!("{at} leaves nothing of the scene")));
         }
     }
     Ok(ResolvedEdits { edits, counts, gaussians: editing.gaussians()? })
+}
+
+/// The error with what it is about.
+fn named(error: &Error, at: &str) -> Error {
+    Error::new(error.code(), format!("{at}: {}", error.message()))
+}
+
+/// What a text takes of the Gaussians as they are now: all that it selects, or these parts of it.
+fn of_text(
+    scored: &SceneTexts,
+    base: &Scene,
+    editing: &Editing,
+    parts: Option<&[u32]>,
+    limits: &Limits,
+    at: &str,
+) -> Result<Selected> {
+    let entries = scored.texts.first().map_or_else(Vec::new, |text| text.selected());
+    let within = match parts {
+        None => Vec::new(),
+        Some(parts) => {
+            let now = base.after_edits(editing.gaussians()?, String::new());
+            part_boxes(scored, &now, &entries, parts, limits, at)?
+        }
+    };
+    Ok(Selected { entries: Some(entries), within })
+}
+
+/// The thing at a pixel of a view of the scene as it is now.
+fn of_pick(now: &Scene, asked: &PickSpec, limits: &Limits) -> Result<Selected> {
+    let view = pick::pick_view(limits, now, asked)?;
+    let picked = pick::pick(now, &view, [asked.x, asked.y])?;
+    let (Some(number), Some(entry)) = (picked.gaussian, picked.entry) else {
+        return Err(Error::invalid("nothing with a label is at this pixel"));
+    };
+    let all = InstanceOptions { count_min: 1, share_min: 0.0, ..Default::default() };
+    let found = instances(now, &[entry], &all);
+    let holds = |part: &&Instance| part.gaussians.iter().any(|&i| u64::from(i) == number);
+    let within = found.iter().find(holds).map(|part| box_of(part, &now.gaussians));
+    Ok(Selected { entries: Some(vec![entry]), within: within.into_iter().collect() })
 }
 
 fn semantic(base: &Arc<Scene>, at: &str) -> Result<SemanticScene> {

@@ -103,7 +103,6 @@ pub struct RefineCalls<'a> {
 /// [`RefineOptions::mends_from`] by cameras that fit the scene of the others, cameras are learnt
 /// from then on, and held-out photos are judged where their cameras fit, before as after.
 ///
-///
 /// # Errors
 /// Those of `calls` and of [`refine::refine`].
 pub fn refined(
