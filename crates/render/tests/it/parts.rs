@@ -4,7 +4,7 @@
 use glam::DVec3;
 use segsplat_core::{
     error::ErrorCode,
-    scene::{Camera, Gaussians},
+    scene::{Camera, Gaussians, Intrinsics},
 };
 use segsplat_render::{
     Frame, FrameStats, Kinds, Labels, RenderRequest, Renderer, Samples, gpu::GpuRenderer,
@@ -32,19 +32,25 @@ fn pictures(frame: Frame) -> Frame {
     Frame { stats: FrameStats::default(), ..frame }
 }
 
-/// Views of a surface of two photos and of a cloud, of which some Gaussians have equal depths.
+/// Views that show some of a surface and of walls, whose Gaussians have equal depths; and views from
+/// anywhere.
 fn cases() -> Vec<(String, Gaussians, RenderRequest)> {
     let mut raw = cloud(40_000, 2, 8).into_raw();
     for (mean, scale) in raw.means.iter_mut().zip(&mut raw.scales) {
         mean[2] = mean[2].round();
         *scale = scale.map(|scale| scale.min(0.02));
     }
-    let scenes = [("photos", two_views(160, 3).0), ("walls", checked(raw))];
+    let straight = camera(90, 70);
+    let aside = |cx: f64| {
+        let intrinsics = Intrinsics { cx, ..straight.intrinsics };
+        request(Camera { intrinsics, ..straight })
+    };
+    let views = [40.0, 110.0, 150.0].map(aside);
     let mut random = Random(7);
     let mut cases = Vec::new();
-    for (name, gaussians) in scenes {
-        for i in 0..6 {
-            let request = any_request(&mut random);
+    for (name, gaussians) in [("photos", two_views(160, 3).0), ("walls", checked(raw))] {
+        let random = [(); 4].map(|()| any_request(&mut random));
+        for (i, request) in views.iter().cloned().chain(random).enumerate() {
             cases.push((format!("{name} {i}"), gaussians.clone(), request));
         }
     }
@@ -88,6 +94,8 @@ fn turning() -> Vec<RenderRequest> {
 #[test]
 fn parts_come_and_go_as_the_camera_turns() {
     let (gaussians, _) = two_views(160, 3);
+    let entries = (0..gaussians.len()).map(|i| (i / 100 % 7) as u16).collect();
+    let gaussians = gaussians.with_semantic_index(entries).expect("as many");
     let (Some(resident), Some(small)) = (holding(1 << 20), holding(gaussians.len() * 6 / 10))
     else {
         return;
