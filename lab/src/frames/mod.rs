@@ -33,7 +33,7 @@ use crate::{
 };
 
 /// Most Gaussians of a generated scene.
-const GAUSSIANS_MAX: usize = 16 << 20;
+const GAUSSIANS_MAX: usize = 32 << 20;
 /// Most frames of the CPU renderer beside those of a GPU.
 const CPU_FRAMES_MAX: usize = 20;
 
