@@ -103,6 +103,14 @@ impl Service {
     fn event(&self, status: &SceneStatus) -> Event {
         let semantics = &status.semantics;
         match status.state {
+            SceneState::Done if status.is_growing() => Event::Running {
+                stage: status
+                    .growth
+                    .stage
+                    .clone()
+                    .unwrap_or_else(|| Stage::SCENE[0].name().to_owned()),
+                fraction: status.growth.fraction,
+            },
             SceneState::Done if semantics.state == SemanticsState::Running => Event::Running {
                 stage: semantics
                     .stage

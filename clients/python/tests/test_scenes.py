@@ -11,11 +11,13 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+from served import run
 
 from segsplat import (
     Cancelled,
     Client,
     Event,
+    Growth,
     InvalidRequest,
     Refinement,
     Scene,
@@ -222,6 +224,32 @@ def test_a_scene_is_refined_while_it_is_served(client: Client, photos: Path) -> 
     assert client.get(scene.id).status.refinement.state in ("none", "done")
     with pytest.raises(InvalidRequest, match="refine is 0 ms"):
         scene.refine(0)
+    scene.delete()
+
+
+def test_photos_join_a_scene_and_leave_it(client: Client, tmp_path: Path) -> None:
+    run("sample", "--photos", "5", "-o", tmp_path / "all")
+    described = json.loads((tmp_path / "all" / "transforms.json").read_bytes())
+    frames = described["frames"]
+
+    def some(name: str, which: list[int]) -> Path:
+        folder = tmp_path / name
+        shutil.copytree(tmp_path / "all" / "images", folder / "images")
+        told = {**described, "frames": [frames[i] for i in which]}
+        (folder / "transforms.json").write_text(json.dumps(told))
+        return folder
+
+    scene = client.scene(some("first", [0, 1, 2]), refine="off")
+    assert scene.status.growth == Growth()
+    scene.add(some("more", [3, 4]))
+    assert scene.status.growth.state == "done" and scene.status.version == 2
+    assert len(scene.photos) == 5 and scene.view(from_=4, width=32).image.any()
+    with pytest.raises(InvalidRequest, match="already"):
+        scene.add(some("again", [4]))
+    scene.remove(scene.photos[0])
+    assert len(scene.photos) == 4 and scene.status.version == 3
+    with pytest.raises(SegSplatError, match="no photo"):
+        scene.remove("images/0000.png")
     scene.delete()
 
 

@@ -70,7 +70,8 @@ pub(super) async fn create(
     let preferred = preferred_wait(request.headers());
     let request_id = request.headers().get(request_id::HEADER);
     let request_id = request_id.and_then(|id| id.to_str().ok()).map(str::to_owned);
-    let (upload, _guard) = read_upload(&api, request, &mut fields).await?;
+    let least = api.service.limits().photos_min;
+    let (upload, _guard) = read_upload(&api, request, &mut fields, least).await?;
     let (options, wait) = options(&api, fields)?;
     // What the query says counts.
     let preferred = preferred.filter(|_| wait.is_none());
@@ -241,7 +242,7 @@ fn options(api: &Api, mut fields: Fields) -> Result<(SceneOptions, Option<Durati
 
 /// Seconds of the preference `wait` (RFC 7240), the first one that is there. A preference that is
 /// not understood is left alone, as that document asks.
-fn preferred_wait(headers: &HeaderMap) -> Option<u32> {
+pub(super) fn preferred_wait(headers: &HeaderMap) -> Option<u32> {
     let values = headers.get_all("prefer").into_iter().filter_map(|value| value.to_str().ok());
     let mut preferences = values.flat_map(|value| value.split(','));
     preferences.find_map(|preference| {
@@ -253,7 +254,7 @@ fn preferred_wait(headers: &HeaderMap) -> Option<u32> {
 }
 
 /// 1 to 255 printable ASCII characters, once.
-fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>> {
+pub(super) fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>> {
     let mut given = headers.get_all("idempotency-key").iter();
     let Some(value) = given.next() else { return Ok(None) };
     if given.next().is_some() {

@@ -153,6 +153,27 @@ pub fn label_photos(
     method: &Method,
     watch: Watch<'_>,
 ) -> Result<LabelledPhotos> {
+    label_more(pipeline, photos, None, seeds, method, watch)
+}
+
+/// The same where the first photos are labelled already, as `known` says: only the others go
+/// through the networks. Masks that depend on other photos, as those by `seeds`, are all made anew.
+///
+/// # Errors
+/// As [`label_photos`].
+pub fn label_more(
+    pipeline: &Pipeline,
+    photos: &[PosedPhoto],
+    known: Option<&LabelledPhotos>,
+    seeds: Option<&Gaussians>,
+    method: &Method,
+    watch: Watch<'_>,
+) -> Result<LabelledPhotos> {
+    // A refinement changes how a scene is drawn, and nothing of its masks.
+    let of_masks = |of: &Method| Method { front_photos: 0, magnify: false, ..of.clone() };
+    let same = |known: &&LabelledPhotos| of_masks(&known.report.method) == of_masks(method);
+    let known = known.filter(|_| seeds.is_none()).filter(same);
+    let photos = known.map_or(photos, |known| photos.get(known.masks.len()..).unwrap_or_default());
     let (network, towers) = (pipeline.masks()?, pipeline.image_text()?);
     let settings = masks::settings(network.manifest(), method);
     let image = &towers.manifest().image;
@@ -175,7 +196,7 @@ pub fn label_photos(
     let mut labelled = std::thread::scope(|scope| {
         // What the first text is compared with, meanwhile; a failure is told to the text.
         (method.preset == Preset::Default).then(|| scope.spawn(|| towers.rivals()));
-        label_photos_with(&tools, photos, method, watch)
+        label_photos_with(&tools, photos, known, method, watch)
     })?;
     labelled.report.bundle_sha256 = pipeline.bundle.sha256().to_owned();
     labelled.report.execution_provider = towers.provider().name().to_owned();
@@ -194,12 +215,14 @@ pub fn understand_with<P: Send>(
     watch: Watch<'_>,
 ) -> Result<Semantics> {
     check_input(input)?;
-    label_photos_with(tools, input.photos, method, watch)?.label_gaussians(input, watch)
+    label_photos_with(tools, input.photos, None, method, watch)?.label_gaussians(input, watch)
 }
 
+/// Labels `photos`, which come after those of `known`.
 fn label_photos_with<P: Send>(
     tools: &SemanticsTools<'_, P>,
     photos: &[PosedPhoto],
+    known: Option<&LabelledPhotos>,
     method: &Method,
     watch: Watch<'_>,
 ) -> Result<LabelledPhotos> {
@@ -229,11 +252,15 @@ fn label_photos_with<P: Send>(
         }
         Ok(found)
     })?;
+    let (masks, embedded) = match known {
+        Some(known) => known.with(masks, embedded),
+        None => (masks, embedded),
+    };
     let clusters = match method.tracks {
         true => None,
         false => Some(stages.run(Stage::Bank, || {
             let wanted = match method.bank_rows as usize {
-                0 => semantics::rows_wanted(embedded.of.len(), photos.len(), method.lambda),
+                0 => semantics::rows_wanted(embedded.of.len(), masks.len(), method.lambda),
                 rows => rows,
             };
             semantics::bank(&embedded.rows, tools.dim, wanted)
@@ -249,7 +276,7 @@ fn label_photos_with<P: Send>(
 }
 
 /// The meaning of a scene's photos: their masks and what each one looks like.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct LabelledPhotos {
     masks: Vec<PhotoMasks>,
     embedded: Embedded,
@@ -262,6 +289,43 @@ pub struct LabelledPhotos {
 }
 
 impl LabelledPhotos {
+    /// Photos that it is of.
+    #[must_use]
+    pub fn photos(&self) -> usize {
+        self.masks.len()
+    }
+
+    /// Bytes of its embeddings and maps.
+    #[must_use]
+    pub fn size_bytes(&self) -> u64 {
+        let maps: usize = self.masks.iter().map(|of| of.map.index.len()).sum();
+        (4 * self.embedded.rows.len() + 2 * maps) as u64
+    }
+
+    /// The same of the photos of these numbers alone, ascending.
+    #[must_use]
+    pub fn only(&self, kept: &[usize]) -> Self {
+        let mut embedded = Embedded::default();
+        let rows = self.embedded.rows.chunks_exact(self.dim.max(1));
+        for (&[photo, mask], row) in self.embedded.of.iter().zip(rows) {
+            if let Some(number) = kept.iter().position(|&one| one == photo) {
+                embedded.of.push([number, mask]);
+                embedded.rows.extend_from_slice(row);
+            }
+        }
+        let masks = kept.iter().map(|&i| self.masks[i].clone()).collect();
+        Self { masks, embedded, clusters: None, dim: self.dim, report: self.report.clone() }
+    }
+
+    /// Masks and embeddings of these photos, then those of photos after them.
+    fn with(&self, masks: Vec<PhotoMasks>, more: Embedded) -> (Vec<PhotoMasks>, Embedded) {
+        let before = self.masks.len();
+        let mut embedded = self.embedded.clone();
+        embedded.rows.extend(more.rows);
+        embedded.of.extend(more.of.into_iter().map(|[photo, mask]| [before + photo, mask]));
+        (self.masks.iter().cloned().chain(masks).collect(), embedded)
+    }
+
     /// Gives it to the scene that was made of these photos: the last stage.
     ///
     /// # Errors
@@ -323,7 +387,7 @@ pub(super) fn check_input(input: &SemanticsInput<'_>) -> Result<()> {
 }
 
 /// Embeddings of all masks that have one.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 struct Embedded {
     /// `[count * dim]`.
     rows: Vec<f32>,
