@@ -180,11 +180,16 @@ impl ReadUploads {
         self.insert(id, Kept { upload, seen: None, until });
     }
 
-    fn insert(&self, id: &SceneId, new: Kept) {
+    /// What the networks said is kept only where it fits beside its upload.
+    fn insert(&self, id: &SceneId, mut new: Kept) {
         let mut uploads = self.uploads.lock();
         uploads.remove(id);
         let needed = uploads.values().filter(|kept| kept.until.is_none());
-        if needed.map(Kept::size_bytes).sum::<u64>() + new.size_bytes() > self.bytes_max {
+        let room = self.bytes_max.saturating_sub(needed.map(Kept::size_bytes).sum());
+        if new.size_bytes() > room {
+            new.seen = None;
+        }
+        if new.size_bytes() > room {
             return;
         }
         let all = |uploads: &HashMap<_, Kept>| uploads.values().map(Kept::size_bytes).sum::<u64>();
@@ -201,11 +206,7 @@ impl ReadUploads {
     pub(super) fn keep_seen(&self, id: &SceneId, seen: Seen) {
         let kept = self.uploads.lock().remove(id);
         if let Some(kept) = kept {
-            let without = Kept { upload: Arc::clone(&kept.upload), ..kept };
             self.insert(id, Kept { seen: Some(Arc::new(seen)), ..kept });
-            if self.find(id).is_none() {
-                self.insert(id, without);
-            }
         }
     }
 

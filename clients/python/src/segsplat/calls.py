@@ -565,7 +565,8 @@ def query(
         fields["camera"] = camera
         fields.update((yield from _size_of_photo(scene, spot, rest)))
     request = Request("POST", f"/v1/scenes/{scene.id}/query", json=_given(fields))
-    return Matches(_json((yield from send(scene.policy, request)).body))
+    answer = _json((yield from send(scene.policy, request)).body)
+    return Matches(answer, getattr(scene, "edit", None))
 
 
 def pick(
