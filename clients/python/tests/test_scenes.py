@@ -43,9 +43,9 @@ def test_events_go_on_until_the_first_text_is_answered(client: Client, photos: P
     with ThreadPoolExecutor(1) as pool:
         asked = pool.submit(scene.query, "box")
         *told, last = events
-        assert asked.result().found
+        assert asked.result()[0].found
     assert last == Event("done") and list(scene.events(semantics=True)) == [last]
-    assert {event.stage for event in told} >= {"masks", "embed"}
+    assert "masks" in [event.stage for event in told]
     fractions = [event.fraction for event in told]
     assert fractions == sorted(fractions)
     scene.delete()
