@@ -25,7 +25,7 @@ use crate::common::{
 };
 
 /// Every call, named as the gRPC methods are, and what it needs.
-const CALLS: [(&str, Scope); 15] = [
+const CALLS: [(&str, Scope); 17] = [
     ("CreateScene", Scope::Write),
     ("ListScenes", Scope::Read),
     ("GetScene", Scope::Read),
