@@ -1119,6 +1119,10 @@ pub struct WatchSceneRequest {
     /// Id.
     #[prost(string, tag = "1")]
     pub scene_id: ::prost::alloc::string::String,
+    /// Go on after the scene is made until its semantics are: who asks a first text at the same time
+    /// sees all of its stages.
+    #[prost(bool, tag = "2")]
+    pub semantics: bool,
 }
 /// What happens to a scene. DONE, FAILED and CANCELLED are last events. Semantics that are being
 /// made while the scene can be viewed already show as RUNNING with their stage.

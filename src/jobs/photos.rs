@@ -184,11 +184,20 @@ impl ReadUploads {
         self.insert(id, Kept { upload, seen: None, labelled: None, until });
     }
 
-    fn insert(&self, id: &SceneId, new: Kept) {
+    /// What the photos mean and what the networks said are kept only where they fit beside the
+    /// upload.
+    fn insert(&self, id: &SceneId, mut new: Kept) {
         let mut uploads = self.uploads.lock();
         uploads.remove(id);
         let needed = uploads.values().filter(|kept| kept.until.is_none());
-        if needed.map(Kept::size_bytes).sum::<u64>() + new.size_bytes() > self.bytes_max {
+        let room = self.bytes_max.saturating_sub(needed.map(Kept::size_bytes).sum());
+        if new.size_bytes() > room {
+            new.labelled = None;
+        }
+        if new.size_bytes() > room {
+            new.seen = None;
+        }
+        if new.size_bytes() > room {
             return;
         }
         let all = |uploads: &HashMap<_, Kept>| uploads.values().map(Kept::size_bytes).sum::<u64>();
@@ -214,11 +223,7 @@ impl ReadUploads {
     fn keep_more(&self, id: &SceneId, with: impl FnOnce(Kept) -> Kept) {
         let kept = self.uploads.lock().remove(id);
         if let Some(kept) = kept {
-            let without = kept.clone();
             self.insert(id, with(kept));
-            if self.find(id).is_none() {
-                self.insert(id, without);
-            }
         }
     }
 

@@ -254,7 +254,7 @@ pub(crate) async fn eventually<T>(why: &str, mut what: impl AsyncFnMut() -> Opti
             return found;
         }
         assert!(begun.elapsed() < Duration::from_secs(60), "{why}: not within a minute");
-        tokio::time::sleep(Duration::from_millis(50)).await;
+        tokio::time::sleep(Duration::from_millis(10)).await;
     }
 }
 
