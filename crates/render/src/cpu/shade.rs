@@ -18,11 +18,13 @@ const CHUNK: usize = 1024;
 
 /// Writes the colour of every visible footprint, in place. The footprints keep the order of the
 /// scene, which suits the rasteriser's cache better than depth order. A scene of degree 0 looks the
-/// same from everywhere, so no direction is computed. Returns the largest number of a colour.
+/// same from everywhere, so no direction is computed. Returns the largest number of a colour if
+/// that is to be `bounded`, else 0.
 pub fn shade(
     gaussians: &Gaussians,
     view: &View,
     options: KernelOptions,
+    bounded: bool,
     projected: &mut Projected,
 ) -> f32 {
     let flat = gaussians.sh_count() == 1 && options.skips(Skip::FlatColor);
@@ -31,7 +33,7 @@ pub fn shade(
     let chunks = footprints.par_chunks_mut(CHUNK);
     let chunks = chunks.zip(tiles_per_gauss.par_chunks(CHUNK)).enumerate();
     let brightest = chunks.map(|(chunk, (footprints, tiles))| {
-        let mut brightest = [0.0_f32; 3];
+        let mut brightest = 0.0_f32;
         for (k, (footprint, &tiles)) in footprints.iter_mut().zip(tiles).enumerate() {
             if tiles > 0 {
                 let (gaussians, i) = shown.find(gaussians, chunk * CHUNK + k);
@@ -42,13 +44,13 @@ pub fn shade(
                     let mean = DVec3::from(gaussians.means()[i].map(f64::from));
                     color(sh, mean - view.center)
                 };
-                // One instruction each, unlike `max`, which knows NaN.
-                for (brightest, value) in brightest.iter_mut().zip(footprint.color) {
-                    *brightest = if value > *brightest { value } else { *brightest };
+                // It waits for what was written, so it is left out where it can be.
+                if bounded {
+                    brightest = footprint.color.into_iter().fold(brightest, f32::max);
                 }
             }
         }
-        brightest.into_iter().fold(0.0, f32::max)
+        brightest
     });
     brightest.reduce(|| 0.0, f32::max)
 }
