@@ -125,7 +125,7 @@ pub fn more(
         return Ok(());
     }
     let all = AllUndecoded::new(&found, limits, cancel)?;
-    let sizes: Vec<u64> = all.more.iter().map(|one| one.header.decoded_pixels()).collect();
+    let sizes: Vec<u64> = all.more.iter().map(|one| one.header.working_pixels()).collect();
     for together in decoded_together(&sizes, limits.photo_pixels_max) {
         let some: Vec<_> = together
             .into_par_iter()
@@ -452,7 +452,7 @@ fn read_all(
         unless_cancelled(cancel)?;
         photos[i].read(side_max, limits)
     };
-    let sizes: Vec<u64> = photos.iter().map(|one| one.header.decoded_pixels()).collect();
+    let sizes: Vec<u64> = photos.iter().map(|one| one.header.working_pixels()).collect();
     let mut all = Vec::with_capacity(photos.len());
     for together in decoded_together(&sizes, limits.photo_pixels_max) {
         let some: Vec<Result<_>> = together.into_par_iter().map(read).collect();
