@@ -56,6 +56,10 @@ const SETTLING_ROUNDS: usize = 2;
 const LEFT_OUT_FROM: f64 = 0.75;
 const LEFT_OUT_FACTOR: f64 = 2.0;
 
+/// A proof that differs so many times as much from the held-out photos as from learnt ones is no
+/// proof: nothing is published (docs/adr/0073).
+const OVERFIT_REFUSED: f64 = 6.0;
+
 /// The work on a version makes all that was done this many times as long.
 const LONGER: u32 = 4;
 
@@ -102,7 +106,9 @@ pub struct RefineCalls<'a> {
 /// ([`RefineOptions::proof_share`]). Where its PSNR on these photos rises over that of what is
 /// served, the scene of all photos is refined in the time of the part that is left, and published.
 /// Where the proof of a further part gains less than [`RefineOptions::gain_min`] in PSNR and SSIM
-/// together ([`Judged::score`]), the work ends: so more time is never worse.
+/// together ([`Judged::score`]), the work ends: so more time is never worse. It also ends with the
+/// first version where the proof overfits ([`RefineOptions::overfit_max`]): what its held-out
+/// photos gain later, other views lose.
 ///
 /// The first scene of all photos goes on from the proof's Gaussians, and those of the held-out
 /// photos, where the proof explains these nearly as well as photos that it learnt
@@ -249,10 +255,17 @@ impl Parts<'_, '_> {
                 Some(whole) => whole,
                 None => self.begin_whole(&proof)?,
             };
+            found.overfit = Some(made.overfit);
+            if made.overfit > OVERFIT_REFUSED {
+                break;
+            }
             let options = RefineOptions { budget: self.rest_of(part, proven.time), ..options };
             found.report = self.publish(&mut made, &mut proof, &options)?;
-            found.overfit = Some(made.overfit);
             found.versions += 1;
+            // What the held-out photos gain by more says nothing of others then.
+            if made.overfit > f64::from(self.options.overfit_max) {
+                break;
+            }
             whole = Some(made);
         }
         Ok(found)

@@ -337,6 +337,29 @@ fn a_first_version_comes_soon_and_others_only_where_they_gain() {
 }
 
 #[test]
+fn a_proof_that_overfits_ends_the_work_and_one_without_worth_publishes_nothing() {
+    let (_, mut photos) = captured(9);
+    let versions = |photos: &[PosedPhoto], overfit_max: f32, first_steps: u32| {
+        let options = RefineOptions { overfit_max, ..steps_of(640, first_steps) };
+        let whole = refined_whole(&cpu(), photos, &options, &|| ());
+        (whole.found.versions, whole.found.overfit.expect("a better proof"))
+    };
+    let (all, overfit) = versions(&photos, 1.5, 40);
+    assert_eq!((all, overfit < 1.5), (3, true), "{overfit}");
+    assert_eq!(versions(&photos, 0.9 * overfit as f32, 40), (1, overfit), "the first stays");
+    // Held-out photos that nothing explains.
+    let mut random = Random(3);
+    for at in held_out(photos.len()) {
+        for value in &mut photos[at].photo.rgb {
+            let noise = if random.range(0.0, 1.0) < 0.5 { -100 } else { 100 };
+            *value = (i32::from(*value) + noise).clamp(0, 255) as u8;
+        }
+    }
+    let (none, overfit) = versions(&photos, 1.5, 160);
+    assert!(none == 0 && overfit > 6.0, "{none} versions, {overfit}");
+}
+
+#[test]
 fn gaussians_are_added_where_the_scene_differs_from_the_photos() {
     let (truth, photos) = captured(9);
     let start = disturbed(&truth).only(|i| i % 4 == 0);
