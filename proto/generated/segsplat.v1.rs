@@ -1122,6 +1122,10 @@ pub struct WatchSceneRequest {
     /// Id.
     #[prost(string, tag = "1")]
     pub scene_id: ::prost::alloc::string::String,
+    /// Go on after the scene is made until its semantics are: who asks a first text at the same time
+    /// sees all of its stages.
+    #[prost(bool, tag = "2")]
+    pub semantics: bool,
 }
 /// What happens to a scene. DONE, FAILED and CANCELLED are last events. Semantics that are being
 /// made while the scene can be viewed already show as RUNNING with their stage.
@@ -1279,7 +1283,7 @@ pub struct SetEditsRequest {
     pub semantics_wait_ms: ::core::option::Option<u64>,
 }
 /// The edits of a scene and what they come to.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SceneEdits {
     /// The list as JSON, as it can be sent again.
     #[prost(string, tag = "1")]
@@ -1290,6 +1294,10 @@ pub struct SceneEdits {
     /// Gaussians of the scene after all of them.
     #[prost(uint64, tag = "3")]
     pub gaussians: u64,
+    /// Share of what the photos showed that has nothing any more, 0 to 1: where no photo saw what is
+    /// behind a thing that is gone.
+    #[prost(double, tag = "4")]
+    pub uncovered: f64,
 }
 /// One view.
 #[derive(Clone, PartialEq, ::prost::Message)]

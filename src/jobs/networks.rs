@@ -465,7 +465,8 @@ impl SemanticNetworks for PipelineNetworks {
         let scene = scene()?;
         let (cameras, gaussians) = (&scene.meta.cameras[..], &scene.gaussians);
         let input = SemanticsInput { photos, cameras, gaussians };
-        let semantics = labelled.clone().label_gaussians(&input, watch)?;
-        Ok((semantics, Some(labelled)))
+        // Seeded masks depend on the photos before: they are of no use beside others.
+        let kept = (!method.seeds).then(|| labelled.clone());
+        Ok((labelled.label_gaussians(&input, watch)?, kept))
     }
 }

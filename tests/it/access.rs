@@ -25,7 +25,7 @@ use crate::common::{
 };
 
 /// Every call, named as the gRPC methods are, and what it needs.
-const CALLS: [(&str, Scope); 15] = [
+const CALLS: [(&str, Scope); 17] = [
     ("CreateScene", Scope::Write),
     ("ListScenes", Scope::Read),
     ("GetScene", Scope::Read),
@@ -131,7 +131,8 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
                 }
                 "Models" => client.models(pb::ModelsRequest {}).await.map(drop),
                 "WatchScene" => {
-                    client.watch_scene(pb::WatchSceneRequest { scene_id }).await.map(drop)
+                    let request = pb::WatchSceneRequest { scene_id, semantics: false };
+                    client.watch_scene(request).await.map(drop)
                 }
                 "Pick" => {
                     let camera = Some(camera);

@@ -1,7 +1,7 @@
 //! Scenes whose photos change: what joins and leaves is in the next version whole, the one before
 //! is served until then, and what was acknowledged lasts.
 
-use std::sync::{Arc, atomic::Ordering};
+use std::sync::{Arc, LazyLock, atomic::Ordering};
 
 use reqwest::StatusCode;
 use segsplat::{
@@ -34,7 +34,9 @@ const ALL: SampleOptions = SampleOptions { photos: 6, width: 64, height: 48, see
 
 /// Some of six posed photos, as a caller sends them.
 fn some(photos: &[usize]) -> Upload {
-    photos_of(&sample::upload(&ALL).expect("the options are in range"), photos)
+    static MADE: LazyLock<Upload> =
+        LazyLock::new(|| sample::upload(&ALL).expect("the options are in range"));
+    photos_of(&MADE, photos)
 }
 
 async fn made(server: &TestServer, photos: &[usize], options: SceneOptions) -> SceneStatus {
@@ -126,7 +128,8 @@ async fn photos_join_a_scene_that_is_served_meanwhile_and_are_there_after_a_rest
     assert_eq!(status, StatusCode::OK);
     assert_ne!(picture(&server, &id, "from=0").await, before, "another version");
     let server = server.restart().await;
-    assert_eq!(server.service.get(&id).await.unwrap(), grown);
+    let kept = server.service.get(&id).await.unwrap();
+    assert_eq!((kept.version, &kept.growth, kept.cameras.len()), (2, &grown.growth, 6));
     assert_eq!(picture(&server, &id, "from=5").await.1, new);
     // Jobs that come read all photos again.
     assert!(gaussians_of(&server, &id, "photo 5").await > 0);
@@ -256,7 +259,7 @@ async fn a_scene_that_grows_keeps_its_semantics_and_its_edits() {
     let url = server.url(&format!("/v1/scenes/{id}/edits"));
     let edits = json!([
         { "op": "delete", "select": { "text": "photo 1" } },
-        { "op": "delete", "select": { "box": { "center": [0, 0, 0], "size": [1e-6, 1e-6, 1e-6] } } },
+        { "op": "delete", "select": { "box": { "center": [0.0, 0.0, 0.0], "size": [1e-6, 1e-6, 1e-6] } } },
     ]);
     let put = client().put(&url).json(&json!({ "edits": edits })).send().await.unwrap();
     assert_eq!(put.status(), StatusCode::OK);
@@ -322,13 +325,13 @@ async fn photos_join_and_leave_over_grpc() {
         assert_eq!((growth.state(), growth.waiting), (pb::GrowthState::Done, 0));
     }
     let reused = client.add_photos(sent(4)).await.expect_err("another photo under that key");
-    assert_eq!(reused.metadata()["segsplat-code"], "idempotency_key_reused");
+    assert_eq!(reused.metadata().get("segsplat-code").unwrap(), "idempotency_key_reused");
     let name = server.service.get(&id).await.unwrap().cameras[0].file.clone();
     let request = pb::RemovePhotoRequest { scene_id: id.to_string(), name, wait_ms: Some(60_000) };
     let left = client.remove_photo(request.clone()).await.expect("it leaves").into_inner();
     assert_eq!((left.version, left.cameras.len()), (3, 3));
     let gone = client.remove_photo(request).await.expect_err("it is gone");
-    assert_eq!(gone.metadata()["segsplat-code"], "not_found");
+    assert_eq!(gone.metadata().get("segsplat-code").unwrap(), "not_found");
 }
 
 #[tokio::test(flavor = "multi_thread")]

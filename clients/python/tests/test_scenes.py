@@ -6,6 +6,7 @@ import io
 import json
 import shutil
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import httpx
@@ -35,6 +36,21 @@ def test_a_scene_tells_how_it_was_made(scene: Scene, client: Client) -> None:
     assert [photo.file for photo in scene.photos] == ["images/0000.png", "images/0001.png"]
     assert client.get(scene.id).report is not None
     assert f"{report.gaussians} Gaussians" in repr(scene)
+
+
+def test_events_go_on_until_the_first_text_is_answered(client: Client, photos: Path) -> None:
+    scene = client.scene(photos, density="full", progress=False)
+    events = scene.events(semantics=True)
+    assert next(events) == Event("done"), "the scene, which nobody has asked"
+    with ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(scene.query, "box")
+        *told, last = events
+        assert asked.result()[0].found
+    assert last == Event("done") and list(scene.events(semantics=True)) == [last]
+    assert "masks" in [event.stage for event in told]
+    fractions = [event.fraction for event in told]
+    assert fractions == sorted(fractions)
+    scene.delete()
 
 
 def test_events_end_with_the_last(client: Client, photos: Path) -> None:

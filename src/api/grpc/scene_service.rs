@@ -62,7 +62,7 @@ impl pb::scene_service_server::SceneService for Api {
     ) -> Answer<Self::WatchSceneStream> {
         answer(self, request, |api, request| async move {
             let id = request.scene_id.parse()?;
-            let events = api.service.watch(&id).await?;
+            let events = api.service.watch_for(&id, request.semantics).await?;
             let cut_off = stream::once(async move { unless_whole(&api, &id).await.err() });
             let cut_off = cut_off.filter_map(|error| ready(error.map(|e| Err(logged(&e)))));
             Ok(events.map(|event| Ok(convert::event(event))).chain(cut_off).boxed())

@@ -335,14 +335,20 @@ def delete(scene: Handle) -> Flow[None]:
             yield from pause(scene.policy, error, again)
 
 
-def events(scene: Handle, tell: Callable[[Event], None] | None = None) -> Flow[None]:
+def events(
+    scene: Handle, tell: Callable[[Event], None] | None = None, *, semantics: bool = False
+) -> Flow[None]:
     """Items: what happens to the scene, from its present state to its last event. While it is
     refined, each better version is one more.
+
+    semantics: go on after the scene is made until its semantics are; the first text makes them.
     """
+    asked = {"semantics": True} if semantics else {}
     again = 0
     while True:
         try:
-            request = Request("GET", f"/v1/scenes/{scene.id}/events", stream=ServerSentEvents)
+            path = f"/v1/scenes/{scene.id}/events"
+            request = Request("GET", path, params=asked, stream=ServerSentEvents)
             yield from send(scene.policy, request)
             made = False
             while (data := (yield Read())) is not None:

@@ -74,7 +74,7 @@ fn needed(
 impl SceneCache {
     /// The Gaussians that `view` shows, all of `request` or a band of it: the whole scene where the
     /// device may hold it, else a part.
-    /// Errors: `limit_exceeded` when they do not fit the budget, the adapter's limits or its memory.
+    /// Errors: `limit_exceeded` when they fit neither budget, adapter nor memory.
     pub(super) fn shown(
         &mut self,
         gpu: &Gpu,

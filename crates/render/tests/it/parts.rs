@@ -32,8 +32,8 @@ fn pictures(frame: Frame) -> Frame {
     Frame { stats: FrameStats::default(), ..frame }
 }
 
-/// Views that show some of a surface and of walls, whose Gaussians have equal depths; and views from
-/// anywhere.
+/// Views that show some of a surface and of walls, whose Gaussians have equal depths; and views
+/// from anywhere.
 fn cases() -> Vec<(String, Gaussians, RenderRequest)> {
     let mut raw = cloud(40_000, 2, 8).into_raw();
     for (mean, scale) in raw.means.iter_mut().zip(&mut raw.scales) {
