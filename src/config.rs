@@ -289,6 +289,8 @@ impl Config {
             format!("jobs is {}; it must be 0 to 64", self.jobs)
         } else if limits.photos_min < 2 || limits.photos_max < limits.photos_min {
             "limits.photos_min must be at least 2 and at most photos_max".to_owned()
+        } else if limits.network_photos_max < limits.photos_min {
+            "limits.network_photos_max must be at least photos_min".to_owned()
         } else if limits.key_requests_per_s == 0 || limits.key_inflight_max == 0 {
             "limits.key_requests_per_s and key_inflight_max must be over 0".to_owned()
         } else if let Some(name) = odd_host {

@@ -202,7 +202,11 @@ async function fit(photos, mayShrink, notes, at = () => {}) {
   }
   if (!mayShrink) return sent;
   const all = bytes(sent) > limits.upload_bytes_max,
-    kept = limits.photos_pixels_kept_max / Math.min(sent.length, most),
+    // What the server keeps of those that networks see, and what fits: half a byte a pixel.
+    kept = Math.min(
+      limits.photos_pixels_kept_max / Math.min(sent.length, limits.network_photos_max),
+      all ? (2 * limits.upload_bytes_max) / sent.length : Infinity,
+    ),
     fitted = [];
   let made = 0;
   for (const [i, photo] of sent.entries()) {

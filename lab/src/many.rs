@@ -188,6 +188,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
                 let calls = RefineCalls {
                     remake: &mut remake,
                     recast: &mut recast,
+                    more: &mut |_| Ok(None),
                     pace: &mut pace,
                     publish: &mut publish,
                 };

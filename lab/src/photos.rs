@@ -167,7 +167,8 @@ fn judge(
             Ok(())
         };
         let (pace, recast) = (&mut |_| Ok(()), &mut || Ok(None));
-        let calls = RefineCalls { remake: &mut remake, recast, pace, publish: &mut publish };
+        let more = &mut |_| Ok(None);
+        let calls = RefineCalls { remake: &mut remake, recast, more, pace, publish: &mut publish };
         refined(renderer, &scene, &given, &variant.options(), calls)?;
         row["refined_psnr"] = row["psnr"].clone();
         if let Some(version) = &best {

@@ -895,6 +895,9 @@ pub struct RefineReport {
     /// Photos that took no part, by file name: their cameras cannot be right.
     #[prost(string, repeated, tag = "9")]
     pub left_out: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// Photos that were learnt beside those of the scene: the networks did not see them.
+    #[prost(uint32, tag = "10")]
+    pub more_photos: u32,
 }
 /// How far a camera is from where it was given.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
@@ -1498,12 +1501,15 @@ pub struct CallerLimits {
     /// Longer side of a photo as the server keeps it, pixels.
     #[prost(uint32, tag = "4")]
     pub photo_side_kept_max: u32,
-    /// Pixels of all photos of a scene as the server keeps them.
+    /// Pixels of all photos that the networks see, as the server keeps them.
     #[prost(uint64, tag = "5")]
     pub photos_pixels_kept_max: u64,
     /// Cameras of one call for views.
     #[prost(uint64, tag = "6")]
     pub cameras_max: u64,
+    /// Those of the photos of a scene that the networks see.
+    #[prost(uint64, tag = "7")]
+    pub network_photos_max: u64,
 }
 /// One network.
 #[derive(Clone, PartialEq, ::prost::Message)]

@@ -30,13 +30,13 @@ use crate::{
     names::named,
     pipeline::{
         self, PhotoSet, Pipeline, ReadSet, Seen, cameras, make_for_refinement,
-        refinement::{RefineCalls, refined, reported, version_of},
+        refinement::{RefineCalls, refined, reported, spooled, version_of},
         semantics::{SemanticsInput, understand},
     },
     refine::{RefineOptions, RefinedVersion},
     scene::{
         CamerasMode, Density, PhotoHash, Preset, Provenance, Refine, RefineReport, Scene, SceneId,
-        SceneMeta, SceneOptions, SemanticsMode, Stage, Upload, Watch,
+        SceneMeta, SceneOptions, SemanticsMode, Stage, Upload, Watch, unless_cancelled,
     },
     service::{check_refine, scene_splats},
     store::{self, write_scene_file, write_semantics_file},
@@ -133,7 +133,8 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let made = made.into_scene(id, store::now_ms(), provenance);
     let mut scene = match (&refiner, &seen) {
         (Some(refiner), Some(seen)) => {
-            refine(&engine, refiner, made, &photos, seen, &options, watch)?
+            let sent = Sent { photos: &photos, upload: &upload, limits: &config.limits };
+            refine(&engine, refiner, made, sent, seen, &options, watch)?
         }
         _ => made,
     };
@@ -159,18 +160,26 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     describe(&path, &scene, total_ms, out)
 }
 
+/// What a scene is made of.
+#[derive(Clone, Copy)]
+struct Sent<'a> {
+    photos: &'a PhotoSet,
+    upload: &'a Upload,
+    limits: &'a Limits,
+}
+
 /// The scene after its refinement; as it was where none was better.
 fn refine(
     engine: &Pipeline,
     (refiner, how): &(Refiner, RefineOptions),
     scene: Scene,
-    photos: &PhotoSet,
+    sent: Sent<'_>,
     seen: &Seen,
     options: &SceneOptions,
     watch: Watch<'_>,
 ) -> Result<Scene> {
     let silent = Watch { progress: &|_, _| (), cancel: watch.cancel };
-    let photos = &photos.photos;
+    let photos = &sent.photos.photos;
     // With the cameras that the photos have now.
     let made_of = Mutex::new((Cow::Borrowed(&photos[..]), Cow::Borrowed(seen)));
     let mut remake = |held: &[usize]| {
@@ -186,6 +195,14 @@ fn refine(
         *made_of.lock() = (Cow::Owned(found), Cow::Owned(seen));
         Ok(Some(poses))
     };
+    let mut more = |side: u32| {
+        let Sent { photos, upload, limits } = sent;
+        if !photos.has_more() {
+            return Ok(None);
+        }
+        let mut pace = || unless_cancelled(watch.cancel);
+        spooled(upload, options.cameras, side, limits, None, &mut pace).map(Some)
+    };
     let mut pace = |spent: f32| {
         (watch.progress)(Stage::Refine, spent);
         Ok(())
@@ -199,6 +216,7 @@ fn refine(
         let calls = RefineCalls {
             remake: &mut remake,
             recast: &mut recast,
+            more: &mut more,
             pace: &mut pace,
             publish: &mut publish,
         };

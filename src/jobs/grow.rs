@@ -158,8 +158,8 @@ impl Jobs {
             return Err(Error::invalid(format!("scene {id} has a photo {twice:?} already")));
         }
         let all = there.len() + files.len();
-        if all > limits.photos_max {
-            return Err(Error::limit("photos of the scene", all, limits.photos_max));
+        if all > limits.network_photos_max {
+            return Err(Error::limit("photos of the scene", all, limits.network_photos_max));
         }
         let object = Store::added_name()?;
         let added = AddedPhotos { object, files, idempotency_key, request_sha256 };
@@ -335,7 +335,7 @@ impl Jobs {
         let cameras = served.meta.cameras.iter().enumerate();
         let served_kept: Vec<usize> =
             cameras.filter(|(_, of)| stays(&of.file)).map(|(i, _)| i).collect();
-        let _room = self.room.take(photos.photos.len(), limits.photos_max, watch.cancel)?;
+        let _room = self.room.take(photos.photos.len(), limits.network_photos_max, watch.cancel)?;
         let seen = self.uploads.find_seen(id);
         let seen = seen.filter(|seen| seen.photos() == before.photos.len());
         let seen = seen.map(|seen| seen.only(&kept));

@@ -118,7 +118,7 @@ impl ReadUpload {
             Content::Unposed(photos) => photos.photos.len(),
             Content::Splats(scene) => {
                 let share = scene.size_bytes() as f64 / limits.splats_bytes_max.max(1) as f64;
-                (share * limits.photos_max as f64).ceil() as usize
+                (share * limits.network_photos_max as f64).ceil() as usize
             }
         }
     }

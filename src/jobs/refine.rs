@@ -27,7 +27,7 @@ use crate::{
     limits::Limits,
     pipeline::{
         PhotoSet,
-        refinement::{RefineCalls, refined, reported, version_of},
+        refinement::{RefineCalls, refined, reported, spooled, version_of},
     },
     refine::{RefineBudget, RefineOptions, RefinedVersion},
     scene::{
@@ -202,6 +202,14 @@ impl Jobs {
             *made_of.lock() = (Cow::Owned(photos), Some(Arc::new(seen)));
             Ok(Some(poses))
         };
+        let mut more = |side: u32| {
+            if !photos.has_more() {
+                return Ok(None);
+            }
+            let (upload, limits) = (self.parts.store.upload(id)?, self.parts.limits.get());
+            let (dir, mode) = (self.parts.store.folder(), record.options.cameras);
+            spooled(&upload, mode, side, &limits, dir, &mut || turns.give_way()).map(Some)
+        };
         let mut told = 0.0;
         let mut pace = |spent: f32| {
             if spent >= told + TOLD {
@@ -216,6 +224,7 @@ impl Jobs {
             let calls = RefineCalls {
                 remake: &mut remake,
                 recast: &mut recast,
+                more: &mut more,
                 pace: &mut pace,
                 publish: &mut publish,
             };

@@ -165,7 +165,7 @@ impl Jobs {
             let upload = self.upload(id, watch)?;
             let limits = self.parts.limits.get();
             let room = upload.room(&limits);
-            let _room = self.room.take(room, limits.photos_max, watch.cancel)?;
+            let _room = self.room.take(room, limits.network_photos_max, watch.cancel)?;
             let upload = self.with_cameras(id, upload, watch)?;
             let Content::Photos(photos) = &upload.content else {
                 self.uploads.forget(id);

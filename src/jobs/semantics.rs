@@ -129,7 +129,8 @@ impl Jobs {
         let cancel = &AtomicBool::new(false);
         let upload = self.upload(&scene.meta.id, Watch { progress: &|_, _| {}, cancel })?;
         let photos = &upload.photos()?.photos;
-        let _room = self.room.take(photos.len(), self.parts.limits.get().photos_max, cancel)?;
+        let _room =
+            self.room.take(photos.len(), self.parts.limits.get().network_photos_max, cancel)?;
         networks.find_words(photos, scene, texts, cancel).map(Some)
     }
 
@@ -180,7 +181,7 @@ impl Jobs {
         let semantics = self.within_time(job, |watch| {
             let upload = self.upload(id, watch)?;
             let photos = &upload.photos()?.photos;
-            let photos_max = self.parts.limits.get().photos_max;
+            let photos_max = self.parts.limits.get().network_photos_max;
             let _room = self.room.take(photos.len(), photos_max, watch.cancel)?;
             let made = || self.made_scene(job);
             let made = self.parts.semantics.make_more(photos, None, &method, &made, watch)?;

@@ -169,11 +169,11 @@ fn check_request(
     limits: &crate::limits::Limits,
 ) -> Result<()> {
     if let Some(views) = options.max_views
-        && !(limits.photos_min..=limits.photos_max).contains(&views)
+        && !(limits.photos_min..=limits.network_photos_max).contains(&views)
     {
         return Err(Error::invalid(format!(
             "max_views is {views}; it must be {} to {}",
-            limits.photos_min, limits.photos_max
+            limits.photos_min, limits.network_photos_max
         )));
     }
     options.method().check()?;

@@ -21,7 +21,7 @@ use crate::{
     store::{Store, StoreLocation},
 };
 
-/// Uploads decoded at the same time: each may hold `limits.photos_max` photos in memory.
+/// Uploads decoded at the same time: each may hold `limits.network_photos_max` photos in memory.
 const UPLOADS_READ_MAX: usize = 2;
 /// Locks that calls with one idempotency key share with few others.
 pub(super) const KEY_LOCKS: usize = 16;

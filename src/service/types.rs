@@ -325,13 +325,15 @@ pub struct ModelsInfo {
 pub struct CallerLimits {
     /// Photos of a scene.
     pub photos_max: usize,
+    /// Those of them that the networks see.
+    pub network_photos_max: usize,
     /// Bytes of an upload.
     pub upload_bytes_max: usize,
     /// Pixels of a photo as it is sent.
     pub photo_pixels_max: u64,
     /// Longer side of a photo as the server keeps it, pixels.
     pub photo_side_kept_max: u32,
-    /// Pixels of all photos of a scene as the server keeps them.
+    /// Pixels of all photos that the networks see, as the server keeps them.
     pub photos_pixels_kept_max: u64,
     /// Cameras of one call for views.
     pub cameras_max: usize,
@@ -341,6 +343,7 @@ impl From<&Limits> for CallerLimits {
     fn from(limits: &Limits) -> Self {
         Self {
             photos_max: limits.photos_max,
+            network_photos_max: limits.network_photos_max,
             upload_bytes_max: limits.upload_bytes_max,
             photo_pixels_max: limits.photo_pixels_max,
             photo_side_kept_max: limits.photo_side_kept_max,

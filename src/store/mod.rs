@@ -112,6 +112,11 @@ fn aside(name: &str) -> String {
 }
 
 impl Store {
+    /// The folder that it is; none where it is a bucket.
+    pub(crate) fn folder(&self) -> Option<&Path> {
+        self.objects.folder()
+    }
+
     /// Whether other processes use the same scenes.
     pub(crate) fn is_shared(&self) -> bool {
         self.shared

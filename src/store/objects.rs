@@ -113,6 +113,11 @@ impl Objects {
         Ok(Self { store, folder, own, runtime: Some(runtime), timeout, turns, looking, refused })
     }
 
+    /// The folder of a local store.
+    pub(super) fn folder(&self) -> Option<&FilePath> {
+        self.folder.as_deref()
+    }
+
     /// Fails where a local store is not the folder of the start any more. One that was moved away
     /// has its lock with it, so nothing may be written to another one of its name.
     fn unless_moved(&self, what: &str) -> Result<()> {

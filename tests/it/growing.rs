@@ -197,7 +197,7 @@ async fn a_call_with_a_key_adds_its_photos_once() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn photos_that_cannot_join_are_refused_and_change_nothing() {
-    let server = TestServer::with(|config, _| config.limits.photos_max = 4).await;
+    let server = TestServer::with(|config, _| config.limits.network_photos_max = 4).await;
     let id = made(&server, &[0, 1, 2], SceneOptions::default()).await.id;
     let unposed = Upload { cameras: None, ..some(&[3]) };
     let mut broken = some(&[3]);

@@ -65,8 +65,9 @@ enum Ask {
 }
 
 /// Limits, a value of each that changes the answer, and what is asked.
-const LIVE: [(&str, u64, Ask); 36] = [
+const LIVE: [(&str, u64, Ask); 37] = [
     ("photos_max", 2, Ask::Photos),
+    ("network_photos_max", 2, Ask::Photos),
     ("photos_min", 4, Ask::Photos),
     ("upload_bytes_max", 1_000, Ask::Photos),
     ("json_values_max", 3, Ask::Photos),

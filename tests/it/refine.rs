@@ -178,6 +178,33 @@ async fn the_networks_run_once_for_a_scene_and_its_refinement_and_again_after_a_
     assert_eq!(networks.1.load(Ordering::Acquire) - before, 1, "what they said is gone");
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn photos_that_the_networks_do_not_see_are_learnt_also_after_a_restart() {
+    let networks = Arc::new(LensedNetworks::default());
+    let server = TestServer::with(|config, parts| {
+        parts.scenes = networks;
+        config.limits.refine_steps_max = 8;
+        config.limits.network_photos_max = 4;
+    });
+    let mut server = server.await;
+    let made = scene(&server, SceneOptions { refine: Some(LONG), ..Default::default() }).await;
+    assert_eq!(made.cameras.len(), 4);
+    let mut version = 0;
+    for _ in 0..2 {
+        let over =
+            until(&server, &made.id, |status| !status.is_refined_now() && status.version > version);
+        let over = over.await;
+        assert_eq!(over.refinement.state, RefineState::Done, "{over:?}");
+        let report = over.report.expect("a report");
+        let refined = report.refinement.expect("a refinement");
+        assert_eq!((refined.more_photos, refined.left_out.len()), (2, 0), "{refined:?}");
+        assert_eq!(over.cameras.len(), 4, "a scene's cameras stay those of its Gaussians");
+        version = over.version;
+        server = server.restart().await;
+        server.service.refine(&made.id, LONG).await.unwrap();
+    }
+}
+
 #[test]
 fn what_the_network_said_is_united_again_without_some_photos() {
     let Some(engine) = engine() else { return };

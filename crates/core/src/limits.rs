@@ -71,8 +71,12 @@ macro_rules! limits {
 }
 
 limits! {
-    /// Photos in one scene: the pipeline's time grows with their number.
-    photos_max: usize = 64;
+    /// Photos that one scene is made of: those that the networks see, and those that only the steps
+    /// of its refinement learn. Of more the best are taken.
+    photos_max: usize = 1_000;
+    /// Photos of one scene that the networks see: their time and memory grow with them. Of more,
+    /// those that see most from different places.
+    network_photos_max: usize = 64;
     /// Fewest photos that give parallax.
     photos_min: usize = 2;
     /// Bytes of one upload, all parts together.

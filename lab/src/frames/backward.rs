@@ -117,7 +117,8 @@ fn trained(
     let photo = Photo { width: lens.width, height: lens.height, rgb, valid: None };
     let photos = vec![TrainingPhoto { photo: &photo, request: request.clone(), pose: 0 }];
     let ssim_share = RefineOptions::default().ssim_share;
-    let set = TrainingSet { gaussians, photos, ssim_share, gaussians_max: 0 };
+    let streamed = Vec::new();
+    let set = TrainingSet { gaussians, photos, streamed, ssim_share, gaussians_max: 0 };
     let Some(mut trainer) = renderer.trainer(&set, u64::MAX)? else { return Ok(None) };
     let rates = LearningRates::default();
     let step =

@@ -138,7 +138,7 @@ fn refine_report(report: RefineReport) -> pb::RefineReport {
     message!(RefineReport from report
         {
             steps, seconds, held_out, psnr_before, psnr_after, gaussians_before, gaussians_after,
-            left_out
+            left_out, more_photos
         }
         cameras: report.cameras.into_iter().map(moved).collect(),
     )
@@ -474,6 +474,7 @@ pub(super) fn models(info: ModelsInfo) -> pb::ModelsResponse {
         message!(CallerLimits from limits
             { photo_pixels_max, photo_side_kept_max, photos_pixels_kept_max }
             photos_max: limits.photos_max as u64,
+            network_photos_max: limits.network_photos_max as u64,
             upload_bytes_max: limits.upload_bytes_max as u64,
             cameras_max: limits.cameras_max as u64,
         )

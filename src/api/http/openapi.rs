@@ -180,7 +180,7 @@ fn bounds(limits: &Limits) -> Value {
     let of_photos = whole(0, SCENE_PHOTOS_MAX.into());
     let centre = range([-FOCAL_RANGE[1], FOCAL_RANGE[1]]);
     let side = whole(1, limits.view_side_max.into());
-    let views = whole(limits.photos_min as u64, limits.photos_max as u64);
+    let views = whole(limits.photos_min as u64, limits.network_photos_max as u64);
     json!({
         "id": { "pattern": "^[0-9a-f]{32}$" },
         "deadline_ms": { "minimum": 1, "format": "uint64" },

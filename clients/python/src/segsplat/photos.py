@@ -42,7 +42,12 @@ def fit(
     if not may_shrink:
         return sent, {}
     every = _bytes(sent) > limits.upload_bytes_max
-    pixels = limits.photos_pixels_kept_max / max(min(len(sent), most), 1)
+    count = max(len(sent), 1)
+    # What the server keeps of those that networks see, and what fits: half a byte a pixel.
+    pixels = min(
+        limits.photos_pixels_kept_max / min(count, limits.network_photos_max),
+        2 * limits.upload_bytes_max / count if every else math.inf,
+    )
     sizes: Sizes = {}
     fitted: list[Part] = []
     for part in sent:

@@ -348,6 +348,8 @@ class RefineReport:
     cameras: tuple[MovedCamera, ...] = ()
     #: Photos that took no part: their cameras cannot be right.
     left_out: tuple[str, ...] = ()
+    #: Photos that were learnt beside those of the scene: the networks did not see them.
+    more_photos: int = 0
 
 
 @dataclass(frozen=True)
@@ -591,10 +593,12 @@ class CallerLimits:
     photo_pixels_max: int
     #: Longer side of a photo as the server keeps it, pixels.
     photo_side_kept_max: int
-    #: Pixels of all photos of a scene as the server keeps them.
+    #: Pixels of all photos that the networks see, as the server keeps them.
     photos_pixels_kept_max: int
     #: Cameras of one call for views.
     cameras_max: int
+    #: Those of the photos of a scene that the networks see.
+    network_photos_max: int = 64
 
 
 @dataclass(frozen=True)

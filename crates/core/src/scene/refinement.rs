@@ -139,6 +139,9 @@ pub struct RefineReport {
     pub gaussians_before: u64,
     /// Gaussians of the version that is served.
     pub gaussians_after: u64,
+    /// Photos that were learnt beside those of the scene: the networks did not see them.
+    #[serde(default)]
+    pub more_photos: u32,
     /// How far the camera of each photo moved, in the order of the cameras; empty where they stay
     /// as they were given.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]

@@ -29,6 +29,8 @@ pub enum WarningCode {
     /// Photos of the upload that were not used: without a camera, kept for tests, more than a scene
     /// takes, or with nothing in common with the others.
     PhotosUnused,
+    /// Photos that the networks do not see: the steps of a refinement learn them.
+    PhotosForSteps,
     /// Photos that the cameras name and that were not sent.
     PhotosMissing,
     /// Several photos are one picture, under different poses.

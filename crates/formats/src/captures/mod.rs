@@ -139,13 +139,44 @@ pub struct FoundPhoto<'a> {
     pub mask: Option<FoundMask<'a>>,
 }
 
+impl FoundPhoto<'_> {
+    fn candidate(&self) -> choose::Candidate<'_> {
+        let (bytes, kind) = (self.bytes.len() as u64, (&self.lens).into());
+        choose::Candidate { pose: &self.pose, bytes, kind }
+    }
+}
+
 /// The photos that make a scene, not decoded.
 #[derive(Debug)]
 pub struct FoundPhotos<'a> {
-    /// In the order of the cameras.
+    /// Those that the networks see, in the order of the cameras.
     pub photos: Vec<FoundPhoto<'a>>,
+    /// Those that only the steps of a refinement learn, in the same order.
+    pub more: Vec<FoundPhoto<'a>>,
     /// What was not used or not there.
     pub warnings: Vec<Warning>,
+}
+
+impl<'a> FoundPhotos<'a> {
+    /// All photos of a scene, those parted that the networks see.
+    fn of(all: Vec<FoundPhoto<'a>>, mut warnings: Vec<Warning>, limits: &Limits) -> Self {
+        let candidates: Vec<_> = all.iter().map(FoundPhoto::candidate).collect();
+        let seen: HashSet<usize> =
+            choose::best(&candidates, limits.network_photos_max).into_iter().collect();
+        let (mut photos, mut more) = (Vec::with_capacity(seen.len()), Vec::new());
+        for (i, photo) in all.into_iter().enumerate() {
+            if seen.contains(&i) { photos.push(photo) } else { more.push(photo) }
+        }
+        let why = format!(
+            "learnt by the steps of a refinement alone; the networks see {} of these {} photos: \
+             those that see most from different places, then the sharpest; `cameras` lists them",
+            photos.len(),
+            photos.len() + more.len()
+        );
+        let names = more.iter().map(|photo| &*photo.name);
+        warnings.extend(told(WarningCode::PhotosForSteps, more.len(), &why, names));
+        Self { photos, more, warnings }
+    }
 }
 
 /// The photos of a form whose cameras are one JSON part.
@@ -217,7 +248,8 @@ fn of_form<'a>(
             ..found(&entries[entry], name.clone(), name.clone(), pose, bytes.into())
         }
     };
-    Ok(FoundPhotos { photos: chosen.into_iter().zip(of_each).map(take).collect(), warnings })
+    let all = chosen.into_iter().zip(of_each).map(take).collect();
+    Ok(FoundPhotos::of(all, warnings, limits))
 }
 
 /// The photos of a capture, and the files of cameras that were read from a disk.
@@ -297,8 +329,8 @@ fn of_folder<'a>(
         };
         Ok(FoundPhoto { mask, ..found(&entries[entry], name, path, pose, bytes) })
     };
-    let photos = chosen.into_iter().zip(of_each).map(take).collect::<Result<_>>()?;
-    Ok((FoundPhotos { photos, warnings }, files))
+    let all = chosen.into_iter().zip(of_each).map(take).collect::<Result<_>>()?;
+    Ok((FoundPhotos::of(all, warnings, limits), files))
 }
 
 /// The message where no camera has its photo.

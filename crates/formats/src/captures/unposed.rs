@@ -112,10 +112,13 @@ fn of_folder<'a>(folder: &Folder<'a>) -> Result<FoundUnposed<'a>> {
         let message = others.trim_start_matches("; ").to_owned();
         warnings.push(Warning { code: WarningCode::PhotosUnused, message, value: 1.0 });
     }
-    let (chosen, left_out) = spread(&photos, folder.limits.photos_max);
+    // The network that finds cameras sees them all.
+    let most = folder.limits.network_photos_max.min(folder.limits.photos_max);
+    let (chosen, left_out) = spread(&photos, most);
     let why = format!(
-        "left out; a scene takes {} of these {} photos, spread evenly in the order of their names",
-        folder.limits.photos_max,
+        "left out; without cameras {} of these {} photos are taken, spread evenly in the order of \
+         their names",
+        most,
         photos.len()
     );
     let count = left_out.len();

@@ -27,8 +27,8 @@ use crate::{
     error::{Error, Result},
     scene::{CameraToWorld, Gaussians, Photo, RawGaussians},
     train::{
-        Exposure, LearningRates, PoseGradient, PoseRates, Trainer, TrainingPhoto, TrainingSet,
-        TrainingStep, absent, adam, checked,
+        Exposure, LearningRates, PoseGradient, PoseRates, StreamedPhoto, Trainer, TrainingPhoto,
+        TrainingSet, TrainingStep, absent, adam, checked,
         growth::{Origins, halves, most_blamed},
         pose::Pose,
     },
@@ -48,14 +48,21 @@ const PHOTO_CHUNK_BYTES: u64 = 32 << 20;
 /// Bytes that a trainer of `set` takes on a device, about.
 pub(super) fn trainer_bytes(set: &TrainingSet<'_>) -> u64 {
     let pixels = |at: &TrainingPhoto<'_>| u64::from(at.photo.width) * u64::from(at.photo.height);
-    let most = set.photos.iter().map(pixels).max().unwrap_or(0);
+    let streamed = streamed_pixels(set);
+    let most = set.photos.iter().map(pixels).max().unwrap_or(0).max(streamed);
     let numbers = 3 * set.gaussians.sh_count() as u64;
     let row = size_of::<GaussianRow>() as u64 + 4 * numbers;
     let learnt = gradient_bytes(1, numbers) + moment_bytes(1, numbers);
     let each = row + learnt + PAIRS_A_GAUSSIAN * PAIR_BYTES;
     // Pictures, what the loss says of them, and SSIM's windows.
     let pictures = most * 4 * (4 + 4 + 9);
-    4 * set.photos.iter().map(pixels).sum::<u64>() + pictures + each * places_of(set) as u64
+    let photos = set.photos.iter().map(pixels).sum::<u64>() + streamed;
+    4 * photos + pictures + each * places_of(set) as u64
+}
+
+/// Pixels of the largest photo that is read for each of its steps: all of them have one place.
+fn streamed_pixels(set: &TrainingSet<'_>) -> u64 {
+    set.streamed.iter().map(StreamedPhoto::pixels).max().unwrap_or(0)
 }
 
 /// Places for Gaussians that a trainer of `set` has.
@@ -80,6 +87,8 @@ struct Target {
     start: u32,
     /// Number of its camera.
     pose: usize,
+    /// Where its pixels are, of one that goes up for each of its steps.
+    streamed: Option<StreamedPhoto>,
 }
 
 /// A [`Trainer`] on a device, with buffers of its own.
@@ -162,10 +171,21 @@ impl DeviceTrainer {
         let (mut targets, mut pixels, mut most) = (Vec::new(), 0_usize, [0_u32; 2]);
         for TrainingPhoto { photo, request, pose } in &set.photos {
             let start = narrow("pixels of photos", pixels)?;
-            targets.push(Target { request: backward_request(request), start, pose: *pose });
+            let (request, pose) = (backward_request(request), *pose);
+            targets.push(Target { request, start, pose, streamed: None });
             pixels += photo.width as usize * photo.height as usize;
             most = [most[0].max(photo.width), most[1].max(photo.height)];
         }
+        // One place for all that are streamed: what is written before a step is written after the
+        // step before.
+        let start = narrow("pixels of photos", pixels)?;
+        for photo in &set.streamed {
+            let request = backward_request(&photo.request);
+            let (lens, pose) = (request.lens(), photo.pose);
+            most = [most[0].max(lens.width), most[1].max(lens.height)];
+            targets.push(Target { request, start, pose, streamed: Some(photo.clone()) });
+        }
+        let pixels = pixels as u64 + streamed_pixels(set);
         let tiles = most.map(|side| u64::from(side.div_ceil(TILE_SIZE)));
         let storage = |label, bytes| gpu.create_buffer(label, bytes, STORAGE);
         let training = TrainingBuffers {
@@ -174,7 +194,7 @@ impl DeviceTrainer {
                 ROW_BYTES,
                 BufferUsages::UNIFORM | BufferUsages::COPY_DST,
             )?,
-            photos: storage("photos to learn", 4 * pixels as u64)?,
+            photos: storage("photos to learn", 4 * pixels)?,
             exposures: storage("exposures", 4 * u64::from(EXPOSURE_WORDS) * targets.len() as u64)?,
             by_windows: storage("windows", 36 * u64::from(most[0]) * u64::from(most[1]))?,
             partials: storage("sums of the loss", 48 * tiles[0] * tiles[1])?,
@@ -276,6 +296,14 @@ impl DeviceTrainer {
         let PhotoStep { at, step, adds, moves, blames } = photo_step;
         let mut target = self.targets.get(at).ok_or_else(|| absent(at))?.clone();
         target.request.camera.camera_to_world = self.poses[target.pose].now;
+        if let Some(photo) = &target.streamed {
+            let pixels = rgba_of(&photo.read()?);
+            let (to, at) = (&self.training.photos, 4 * u64::from(target.start));
+            let bytes = bytemuck::cast_slice(&pixels);
+            self.on
+                .gpu
+                .scoped("a photo to learn", || self.on.gpu.queue.write_buffer(to, at, bytes))?;
+        }
         let rates = &step.rates;
         let row = TrainingRow {
             means: rates.means,

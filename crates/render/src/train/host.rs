@@ -1,9 +1,11 @@
 //! Steps of which a renderer takes the drawing and going back, and the processor the rest.
 
+use std::sync::Arc;
+
 use rayon::prelude::*;
 
 use super::{
-    Exposure, PhotoLoss, Trainer, TrainingPhoto, TrainingSet, TrainingStep, absent,
+    Exposure, PhotoLoss, StreamedPhoto, Trainer, TrainingPhoto, TrainingSet, TrainingStep, absent,
     adam::{Adam, checked},
     growth::{halves, most_blamed},
     photo_loss,
@@ -14,16 +16,35 @@ use crate::{
     DifferentiableRenderer, Frame, RenderRequest,
     backward::{FrameGradients, Gradients},
     error::Result,
-    scene::{CameraToWorld, Gaussians},
+    scene::{CameraToWorld, Gaussians, Photo},
 };
 
-/// A photo as the loss needs it.
+/// The pixels of a photo as the loss needs them.
 #[derive(Debug)]
-struct Target {
-    request: RenderRequest,
+struct Pixels {
     /// `[H * W]` 0..1.
     rgb: Vec<[f32; 3]>,
     valid: Option<Vec<bool>>,
+}
+
+impl Pixels {
+    fn of(photo: &Photo) -> Arc<Self> {
+        Arc::new(Self { rgb: unit(photo), valid: photo.valid.clone() })
+    }
+}
+
+/// Where the pixels of a photo are.
+#[derive(Debug)]
+enum Place {
+    Kept(Arc<Pixels>),
+    Streamed(Box<StreamedPhoto>),
+}
+
+/// A photo to learn from.
+#[derive(Debug)]
+struct Target {
+    request: RenderRequest,
+    place: Place,
     exposure: Exposure,
     loss: f64,
     /// Number of its camera.
@@ -31,10 +52,24 @@ struct Target {
 }
 
 impl Target {
-    fn new(TrainingPhoto { photo, request, pose }: &TrainingPhoto<'_>) -> Self {
-        let (request, valid, rgb) = (request.clone(), photo.valid.clone(), unit(photo));
-        let (exposure, pose) = (Exposure::default(), *pose);
-        Self { request, rgb, valid, exposure, loss: f64::NAN, pose }
+    fn new(request: &RenderRequest, place: Place, pose: usize) -> Self {
+        let (request, exposure) = (request.clone(), Exposure::default());
+        Self { request, place, exposure, loss: f64::NAN, pose }
+    }
+
+    fn kept(TrainingPhoto { photo, request, pose }: &TrainingPhoto<'_>) -> Self {
+        Self::new(request, Place::Kept(Pixels::of(photo)), *pose)
+    }
+
+    fn streamed(photo: &StreamedPhoto) -> Self {
+        Self::new(&photo.request, Place::Streamed(Box::new(photo.clone())), photo.pose)
+    }
+
+    fn pixels(&self) -> Result<Arc<Pixels>> {
+        match &self.place {
+            Place::Kept(pixels) => Ok(Arc::clone(pixels)),
+            Place::Streamed(photo) => photo.read().map(|photo| Pixels::of(&photo)),
+        }
     }
 
     /// Its view, where its camera stands now.
@@ -45,12 +80,19 @@ impl Target {
     }
 
     /// What the loss says of a frame; the exposure moves.
-    fn compare(&mut self, frame: &Frame, ssim_share: f32, rate: f32) -> FrameGradients {
+    fn compare(
+        &mut self,
+        photo: &Pixels,
+        frame: &Frame,
+        ssim_share: f32,
+        rate: f32,
+    ) -> FrameGradients {
         let plain = frame.color.as_deref().unwrap_or_default();
         let exposure = self.exposure;
         let shown: Vec<[f32; 3]> = plain.par_iter().map(|color| exposure.of(*color)).collect();
-        let (width, valid) = (frame.width as usize, self.valid.as_deref());
-        let PhotoLoss { value, gradient } = photo_loss(&shown, &self.rgb, width, valid, ssim_share);
+        let (width, valid) = (frame.width as usize, photo.valid.as_deref());
+        let PhotoLoss { value, gradient } =
+            photo_loss(&shown, &photo.rgb, width, valid, ssim_share);
         let mut by = gradient;
         self.loss = value;
         self.exposure.step(plain, &by, rate);
@@ -60,14 +102,14 @@ impl Target {
     }
 
     /// How far each number of a frame is from the photo.
-    fn differences(&self, frame: &Frame) -> FrameGradients {
+    fn differences(&self, photo: &Pixels, frame: &Frame) -> FrameGradients {
         let plain = frame.color.as_deref().unwrap_or_default();
-        let known = |i: usize| self.valid.as_ref().is_none_or(|valid| valid[i]);
-        let away = |(i, (color, photo)): (usize, (&[f32; 3], &[f32; 3]))| {
+        let known = |i: usize| photo.valid.as_ref().is_none_or(|valid| valid[i]);
+        let away = |(i, (color, right)): (usize, (&[f32; 3], &[f32; 3]))| {
             let shown = self.exposure.of(*color);
-            std::array::from_fn(|c| if known(i) { (shown[c] - photo[c]).abs() } else { 0.0 })
+            std::array::from_fn(|c| if known(i) { (shown[c] - right[c]).abs() } else { 0.0 })
         };
-        let away = plain.par_iter().zip(&self.rgb).enumerate().map(away).collect();
+        let away = plain.par_iter().zip(&photo.rgb).enumerate().map(away).collect();
         FrameGradients { color: Some(away), ..FrameGradients::default() }
     }
 }
@@ -93,11 +135,13 @@ impl<'a> HostTrainer<'a> {
     /// `internal` for a photo of another size than its view.
     pub fn new(renderer: &'a dyn DifferentiableRenderer, set: &TrainingSet<'_>) -> Result<Self> {
         set.check()?;
+        let mut targets: Vec<Target> = set.photos.par_iter().map(Target::kept).collect();
+        targets.extend(set.streamed.iter().map(Target::streamed));
         Ok(Self {
             renderer,
             gaussians: set.gaussians.clone(),
             adam: Adam::new(set.gaussians),
-            targets: set.photos.par_iter().map(Target::new).collect(),
+            targets,
             poses: set.poses(),
             ssim_share: set.ssim_share,
             gaussians_max: set.gaussians_max,
@@ -111,8 +155,9 @@ impl Trainer for HostTrainer<'_> {
         let Self { renderer, gaussians, adam, targets, poses, ssim_share, found, .. } = self;
         for (place, &at) in photos.iter().enumerate() {
             let target = targets.get_mut(at).ok_or_else(|| absent(at))?;
-            let request = target.view(poses);
-            let mut loss = |frame: &Frame| Ok(target.compare(frame, *ssim_share, step.exposure));
+            let (request, photo) = (target.view(poses), target.pixels()?);
+            let mut loss =
+                |frame: &Frame| Ok(target.compare(&photo, frame, *ssim_share, step.exposure));
             let into = if place == 0 { &mut found.0 } else { &mut found.1 };
             renderer.backward(gaussians, &request, &mut loss, into)?;
             if step.poses.moves() {
@@ -141,7 +186,8 @@ impl Trainer for HostTrainer<'_> {
         let mut blame = vec![0.0; count];
         for &at in photos {
             let target = targets.get(at).ok_or_else(|| absent(at))?;
-            let mut loss = |frame: &Frame| Ok(target.differences(frame));
+            let photo = target.pixels()?;
+            let mut loss = |frame: &Frame| Ok(target.differences(&photo, frame));
             renderer.backward(gaussians, &target.view(poses), &mut loss, found)?;
             let by_colour = found.sh.par_chunks(k).with_min_len(1 << 12);
             blame.par_iter_mut().zip(by_colour).for_each(|(blame, by)| {

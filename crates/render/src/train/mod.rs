@@ -14,6 +14,7 @@ pub(crate) mod growth;
 mod host;
 pub mod photo_loss;
 pub mod pose;
+mod streamed;
 
 pub use self::{
     adam::{LearningRates, checked},
@@ -21,6 +22,7 @@ pub use self::{
     host::HostTrainer,
     photo_loss::{PhotoLoss, photo_loss},
     pose::{PoseGradient, PoseRates},
+    streamed::{PhotoSource, StreamedPhoto},
 };
 use crate::{
     Frame, RenderRequest,
@@ -45,8 +47,10 @@ pub struct TrainingPhoto<'a> {
 pub struct TrainingSet<'a> {
     /// The Gaussians to move.
     pub gaussians: &'a Gaussians,
-    /// The photos, which steps name by their numbers.
+    /// The photos that the trainer keeps. Steps name photos by their numbers.
     pub photos: Vec<TrainingPhoto<'a>>,
+    /// Photos that are read for each of their steps. Their numbers go on behind those of `photos`.
+    pub streamed: Vec<StreamedPhoto>,
     /// Share of SSIM in the loss, 0..1.
     pub ssim_share: f32,
     /// Most Gaussians that [`Trainer::grow`] makes of them.
@@ -54,11 +58,17 @@ pub struct TrainingSet<'a> {
 }
 
 impl TrainingSet<'_> {
+    /// The views of all photos and the numbers of their cameras, by the numbers of the photos.
+    fn views(&self) -> impl Iterator<Item = (&RenderRequest, usize)> {
+        let kept = self.photos.iter().map(|photo| (&photo.request, photo.pose));
+        kept.chain(self.streamed.iter().map(|photo| (&photo.request, photo.pose)))
+    }
+
     /// The cameras of the photos.
     pub(crate) fn poses(&self) -> Vec<pose::Pose> {
         let mut poses = Vec::new();
-        for TrainingPhoto { request, pose, .. } in &self.photos {
-            if *pose == poses.len() {
+        for (request, pose) in self.views() {
+            if pose == poses.len() {
                 poses.push(pose::Pose::new(request.camera.camera_to_world));
             }
         }
@@ -71,11 +81,13 @@ impl TrainingSet<'_> {
     /// `internal`, with both.
     pub(crate) fn check(&self) -> Result<()> {
         let mut poses = 0;
-        for TrainingPhoto { photo, request, pose } in &self.photos {
-            if *pose > poses {
+        for (_, pose) in self.views() {
+            if pose > poses {
                 return Err(Error::internal(format!("training: camera {pose} after {poses}")));
             }
             poses = poses.max(pose + 1);
+        }
+        for TrainingPhoto { photo, request, .. } in &self.photos {
             let lens = request.lens();
             let (has, shown) = ([photo.width, photo.height], [lens.width, lens.height]);
             if has != shown {

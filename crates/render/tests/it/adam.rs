@@ -133,7 +133,8 @@ fn steps_are_those_of_pytorch() {
     let request = RenderRequest { kinds: Kinds::COLOR, ..request(camera(width, height)) };
     let photos = vec![TrainingPhoto { photo: &photo, request, pose: 0 }];
     let given = Given::new();
-    let set = TrainingSet { gaussians: &start, photos, ssim_share: 0.2, gaussians_max: 0 };
+    let (streamed, ssim_share) = (Vec::new(), 0.2);
+    let set = TrainingSet { gaussians: &start, photos, streamed, ssim_share, gaussians_max: 0 };
     let mut trainer = HostTrainer::new(&given, &set).expect("a trainer");
     let rates = LearningRates {
         means: 1e-2,

@@ -44,7 +44,7 @@ fn set<'a>(
         pose: 0,
     };
     let photos = photos.iter().map(photo).collect();
-    TrainingSet { gaussians, photos, ssim_share: 0.2, gaussians_max }
+    TrainingSet { gaussians, photos, streamed: Vec::new(), ssim_share: 0.2, gaussians_max }
 }
 
 /// Four discs before the camera, each of its own colour, view and entry.

@@ -33,6 +33,7 @@ mod shader_layout;
 mod skips;
 mod smaller;
 mod stages;
+mod streamed;
 mod train;
 mod twins;
 mod widths;

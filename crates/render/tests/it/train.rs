@@ -144,7 +144,8 @@ pub(crate) fn set<'a>(
     };
     let photos = photos.iter().map(photo).enumerate();
     let photos = photos.map(|(pose, photo)| TrainingPhoto { pose, ..photo }).collect();
-    TrainingSet { gaussians, photos, ssim_share: SHARE, gaussians_max: gaussians.len() }
+    let (streamed, gaussians_max) = (Vec::new(), gaussians.len());
+    TrainingSet { gaussians, photos, streamed, ssim_share: SHARE, gaussians_max }
 }
 
 pub(crate) fn step(opacity_min: f32) -> TrainingStep {
@@ -175,7 +176,7 @@ fn the_shaders_of_the_loss_agree_with_the_oracle() {
 }
 
 /// Numbers of Gaussians of each kind.
-fn kinds(gaussians: &Gaussians) -> [(&'static str, Vec<f32>); 5] {
+pub(crate) fn kinds(gaussians: &Gaussians) -> [(&'static str, Vec<f32>); 5] {
     let raw = gaussians.clone().into_raw();
     [
         ("means", raw.means.as_flattened().to_vec()),

@@ -24,6 +24,8 @@ pub(super) struct Header {
     pub(super) orientation: Orientation,
     /// The photo is decoded at one over this of its size.
     pub(super) reduction: u32,
+    /// All of its coefficients are in memory before a pixel is: a reduced progressive JPEG.
+    is_whole_first: bool,
 }
 
 impl Header {
@@ -44,8 +46,16 @@ impl Header {
     }
 
     /// Pixels that are decoded.
-    pub(super) fn decoded_pixels(&self) -> u64 {
+    fn decoded_pixels(&self) -> u64 {
         self.decoded_size().map(u64::from).into_iter().product()
+    }
+
+    /// Pixels that take memory while it is decoded: some 7 bytes each, as coefficients do at most.
+    pub(super) fn working_pixels(&self) -> u64 {
+        match self.is_whole_first {
+            true => u64::from(self.width) * u64::from(self.height),
+            false => self.decoded_pixels(),
+        }
     }
 }
 
@@ -60,8 +70,9 @@ const REDUCTIONS: [u32; 3] = [1, 2, 4];
 /// format: four channels of 16 bits.
 const BYTES_A_PIXEL: u64 = 8;
 /// Progressive JPEGs are kept whole as coefficients while they are decoded, so of these no more
-/// pixels are taken than this many times the limit.
-const PROGRESSIVE_TIMES: u64 = 2;
+/// pixels are taken than this many times the limit: 120 megapixels take at most 0.7 GiB, and are
+/// decoded alone.
+const PROGRESSIVE_TIMES: u64 = 5;
 
 /// A decoder that takes memory for the deepest pixel (RGBA of 16 bits) and working space at most.
 fn reader<'a>(
@@ -103,12 +114,14 @@ pub(super) fn header(bytes: &[u8], what: &str, limits: &Limits) -> Result<Header
     };
     let orientation = orientation.unwrap_or(Orientation::NoTransforms);
     let (pixels, max) = (u64::from(width) * u64::from(height), limits.photo_pixels_max);
+    let is_whole_first = format == ImageFormat::Jpeg && pixels > max && is_progressive(bytes);
+    let header =
+        |reduction| Header { format, width, height, orientation, reduction, is_whole_first };
     let reduction = match format {
         _ if pixels <= max => Some(1),
         ImageFormat::Jpeg => {
-            let header = |reduction| Header { format, width, height, orientation, reduction };
             let fits = |reduction: &u32| header(*reduction).decoded_pixels() <= max;
-            let taken = !is_progressive(bytes) || pixels <= PROGRESSIVE_TIMES * max;
+            let taken = !is_whole_first || pixels <= PROGRESSIVE_TIMES.saturating_mul(max);
             REDUCTIONS.into_iter().find(fits).filter(|_| taken)
         }
         _ => {
@@ -124,8 +137,9 @@ pub(super) fn header(bytes: &[u8], what: &str, limits: &Limits) -> Result<Header
     };
     let Some(reduction) = reduction else {
         let bound = match format {
-            ImageFormat::Jpeg if is_progressive(bytes) => {
-                format!("{} px of a progressive JPEG; save it as a baseline JPEG", 2 * max)
+            ImageFormat::Jpeg if is_whole_first => {
+                let bound = PROGRESSIVE_TIMES.saturating_mul(max);
+                format!("{bound} px of a progressive JPEG; save it as a baseline JPEG")
             }
             ImageFormat::Jpeg => format!("{} px of a JPEG", max.saturating_mul(16)),
             _ => format!("{max} px of a {}; as JPEG larger ones are read", kinds::name(format)),
@@ -138,7 +152,7 @@ pub(super) fn header(bytes: &[u8], what: &str, limits: &Limits) -> Result<Header
             bytes.len()
         )));
     }
-    Ok(Header { format, width, height, orientation, reduction })
+    Ok(header(reduction))
 }
 
 /// Focal length of the EXIF of a photo, pixels of a picture of this size.
@@ -390,5 +404,21 @@ mod tests {
         for cut in 0..png.len() {
             assert!(png.starts_with(&picture_of_png(&png[..cut])), "{cut}");
         }
+    }
+
+    #[test]
+    fn a_progressive_jpeg_is_reduced_up_to_five_times_the_limit_and_counts_whole() {
+        let jpeg = include_bytes!("../../tests/fixtures/progressive.jpg");
+        let read = |photo_pixels_max: u64| {
+            let limits = Limits { photo_pixels_max, ..Limits::default() };
+            let header = header(jpeg, "a photo", &limits)?;
+            let photo = pixels(jpeg, &header, Orientation::NoTransforms, "a photo", &limits)?;
+            Ok::<_, Error>((header.working_pixels(), [photo.width, photo.height]))
+        };
+        assert_eq!(read(64 * 48).unwrap(), (64 * 48, [64, 48]), "whole");
+        assert_eq!(read(64 * 48 / 4).unwrap(), (64 * 48, [32, 24]), "at a half, alone");
+        assert_eq!(read(64 * 48 / 5 + 1).unwrap(), (64 * 48, [16, 12]), "at a quarter");
+        let told = read(64 * 48 / 5 - 1).unwrap_err();
+        assert!(told.message().contains("3065 px of a progressive JPEG"), "{told}");
     }
 }

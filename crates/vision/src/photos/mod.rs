@@ -92,7 +92,7 @@ pub fn read_dir_until(
     let (found, cameras) = find_in_dir(dir, limits)?;
     let read = decoded(&found, limits, cancel)?;
     let (mut photos, mut masks) = (Vec::new(), BTreeMap::new());
-    for of in found.photos {
+    for of in found.photos.into_iter().chain(found.more) {
         photos.push(UploadFile { name: of.path, bytes: of.bytes.into_owned() });
         // Several photos may have one mask.
         masks.extend(of.mask.map(|mask| (mask.path, mask.bytes.into_owned())));
@@ -100,6 +100,45 @@ pub fn read_dir_until(
     let masks = masks.into_iter().map(|(name, bytes)| UploadFile { name, bytes });
     photos.extend(cameras.into_iter().chain(masks));
     Ok((read, Upload { photos, ..Upload::default() }))
+}
+
+/// Reads the photos of an upload that only the steps of a refinement learn, each with its longer
+/// side at most `side_max`, and hands them on in their order, a few at a time. One whose pixels
+/// cannot be read is left out.
+///
+/// # Errors
+/// As [`read`]; `cancelled`; those of `put`.
+pub fn more(
+    upload: &Upload,
+    mode: CamerasMode,
+    side_max: u32,
+    limits: &Limits,
+    cancel: &AtomicBool,
+    mut put: impl FnMut(&PosedPhoto) -> Result<()>,
+) -> Result<()> {
+    // Those whose cameras are solved have all been seen by networks.
+    if find_unposed(upload, mode, limits)?.is_some() {
+        return Ok(());
+    }
+    let found = find(upload, limits)?;
+    if found.more.is_empty() {
+        return Ok(());
+    }
+    let all = AllUndecoded::new(&found, limits, cancel)?;
+    let sizes: Vec<u64> = all.more.iter().map(|one| one.header.working_pixels()).collect();
+    for together in decoded_together(&sizes, limits.photo_pixels_max) {
+        let some: Vec<_> = together
+            .into_par_iter()
+            .map(|i| unless_cancelled(cancel).map(|()| all.more[i].read(side_max, limits)))
+            .collect::<Result<_>>()?;
+        for read in some {
+            match read {
+                Ok((photo, _)) => put(&photo)?,
+                Err(error) => tracing::warn!(reason = error.message(), "not learnt"),
+            }
+        }
+    }
+    Ok(())
 }
 
 /// The photos of an upload whose cameras are to be solved; `None` where it has cameras that count.
@@ -220,7 +259,10 @@ fn valid_share(photo: &Photo) -> f64 {
 
 /// The photos of a scene whose headers are read, and whose pixels are not.
 struct AllUndecoded<'f, 'a> {
+    /// Those that the networks see.
     photos: Vec<Undecoded<'f, 'a>>,
+    /// Those that only steps learn.
+    more: Vec<Undecoded<'f, 'a>>,
     /// Longer side at which they are kept.
     side_max: u32,
     /// What was done that nobody asked for.
@@ -229,36 +271,50 @@ struct AllUndecoded<'f, 'a> {
 
 impl<'f, 'a> AllUndecoded<'f, 'a> {
     fn new(found: &'f FoundPhotos<'a>, limits: &Limits, cancel: &AtomicBool) -> Result<Self> {
-        let header = |(i, photo): (usize, &FoundPhoto<'_>)| {
-            let label = label(i, &photo.named);
-            let header = decode::header(&photo.bytes, &label, limits)?;
-            Ok((label, header))
+        let with_headers = |found: &'f [FoundPhoto<'a>]| -> Result<Vec<WithHeader<'f, 'a>>> {
+            found.iter().enumerate().map(|(i, found)| WithHeader::new(i, found, limits)).collect()
         };
-        let headers: Vec<(String, Header)> =
-            found.photos.iter().enumerate().map(header).collect::<Result<_>>()?;
-        let all = || found.photos.iter().zip(&headers);
-        let ways: Vec<Option<Way>> =
-            all().map(|(photo, (_, header))| turns::way(header, &photo.lens)).collect();
-        let photos = |either: bool| -> Result<Vec<Undecoded<'f, 'a>>> {
-            let photo = |((photo, (label, header)), way): ((&'f _, &(String, Header)), _)| {
-                let is_turned = way == &Some(Way::Turned) || either && way == &Some(Way::Either);
-                let turn = if is_turned { header.orientation } else { Orientation::NoTransforms };
-                Undecoded::new(photo, label.clone(), *header, turn)
-            };
-            all().zip(&ways).map(photo).collect()
+        let (seen, more) = (with_headers(&found.photos)?, with_headers(&found.more)?);
+        let photos = |all: &[WithHeader<'f, 'a>], either: bool| -> Result<Vec<Undecoded<'f, 'a>>> {
+            all.iter().map(|one| one.undecoded(either)).collect()
         };
         let small = |either: bool| -> Result<Vec<PosedPhoto>> {
-            let read = read_all(&photos(either)?, SIDE_COMPARED, limits, cancel)?;
+            let read = read_all(&photos(&seen, either)?, SIDE_COMPARED, limits, cancel)?;
             Ok(read.into_iter().map(|(photo, _)| photo).collect())
         };
         let names: Vec<&str> = found.photos.iter().map(|photo| &*photo.named).collect();
+        let ways: Vec<Option<Way>> = seen.iter().map(|one| one.way).collect();
         let (either, turned) = turns::settled(&names, &ways, small, cancel)?;
-        let photos = photos(either)?;
+        let (photos, more) = (photos(&seen, either)?, photos(&more, either)?);
         let sizes: Vec<[u32; 2]> = photos.iter().map(Undecoded::size).collect();
         let mut warnings: Vec<Warning> = turned.into_iter().collect();
         warnings.extend(large(&photos, limits));
         warnings.extend(undone_lens(&photos));
-        Ok(Self { side_max: side_kept(&sizes, limits), photos, warnings })
+        Ok(Self { side_max: side_kept(&sizes, limits), photos, more, warnings })
+    }
+}
+
+/// A photo whose header is read, and of which it is not known yet whether it is turned.
+struct WithHeader<'f, 'a> {
+    found: &'f FoundPhoto<'a>,
+    label: String,
+    header: Header,
+    way: Option<Way>,
+}
+
+impl<'f, 'a> WithHeader<'f, 'a> {
+    fn new(i: usize, found: &'f FoundPhoto<'a>, limits: &Limits) -> Result<Self> {
+        let label = label(i, &found.named);
+        let header = decode::header(&found.bytes, &label, limits)?;
+        let way = turns::way(&header, &found.lens);
+        Ok(Self { found, label, header, way })
+    }
+
+    /// The photo, turned where that is known, or where it may be either way and `either` is right.
+    fn undecoded(&self, either: bool) -> Result<Undecoded<'f, 'a>> {
+        let is_turned = self.way == Some(Way::Turned) || either && self.way == Some(Way::Either);
+        let turn = if is_turned { self.header.orientation } else { Orientation::NoTransforms };
+        Undecoded::new(self.found, self.label.clone(), self.header, turn)
     }
 }
 
@@ -396,7 +452,7 @@ fn read_all(
         unless_cancelled(cancel)?;
         photos[i].read(side_max, limits)
     };
-    let sizes: Vec<u64> = photos.iter().map(|one| one.header.decoded_pixels()).collect();
+    let sizes: Vec<u64> = photos.iter().map(|one| one.header.working_pixels()).collect();
     let mut all = Vec::with_capacity(photos.len());
     for together in decoded_together(&sizes, limits.photo_pixels_max) {
         let some: Vec<Result<_>> = together.into_par_iter().map(read).collect();

@@ -44,7 +44,7 @@ pub(super) fn decoded(
         unless_cancelled(cancel)?;
         all[i].read(side_max, limits)
     };
-    let sizes: Vec<u64> = all.iter().map(|one| one.header.decoded_pixels()).collect();
+    let sizes: Vec<u64> = all.iter().map(|one| one.header.working_pixels()).collect();
     let mut photos = Vec::with_capacity(all.len());
     for together in decoded_together(&sizes, limits.photo_pixels_max) {
         let some: Vec<Result<_>> = together.into_par_iter().map(read).collect();

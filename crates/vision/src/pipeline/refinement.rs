@@ -4,7 +4,11 @@
 //! out, and semantics that follow other Gaussians.
 
 use std::{
-    sync::mpsc::{RecvTimeoutError, channel},
+    path::Path,
+    sync::{
+        atomic::AtomicBool,
+        mpsc::{RecvTimeoutError, channel},
+    },
     thread,
     time::{Duration, Instant},
 };
@@ -16,15 +20,19 @@ use segsplat_render::{DifferentiableRenderer, Kinds, RenderRequest, plan::defaul
 use super::Reconstruction;
 use crate::{
     error::Result,
+    limits::Limits,
     models::{ResizeFilter, fit},
+    photos,
     refine::{
-        self, ALIGNING_STEPS, Judged, RefineBudget, RefineOptions, RefinedVersion, Stepped,
-        UNWATCHED_STEPS_MAX, aligned, carried, covered, differences, extent, fewer, held_out,
-        judged_as_plain, judged_as_served, ready, unexplained,
+        self, ALIGNING_STEPS, Judged, LearntPhotos, MorePhotos, PhotoSpool, RefineBudget,
+        RefineOptions, RefinedVersion, Stepped, UNWATCHED_STEPS_MAX, aligned, carried, covered,
+        differences, extent, fewer, held_out, judged_as_plain, judged_as_served, ready,
+        unexplained,
     },
     scene::{
-        Camera, CameraToWorld, CameraUse, Gaussians, HealthReport, Method, MovedCamera, Photo,
-        PosedPhoto, RefineReport, Scene, SceneCamera, SceneMeta, Semantics,
+        Camera, CameraToWorld, CameraUse, CamerasMode, Gaussians, HealthReport, Method,
+        MovedCamera, Photo, PosedPhoto, RefineReport, Scene, SceneCamera, SceneMeta, Semantics,
+        Upload,
     },
     semantics::{Views, from_source},
 };
@@ -47,6 +55,10 @@ const SETTLING_ROUNDS: usize = 2;
 /// much as of the one in the middle, are left out: their cameras cannot be right (docs/adr/0078).
 const LEFT_OUT_FROM: f64 = 0.75;
 const LEFT_OUT_FACTOR: f64 = 2.0;
+
+/// A proof that differs so many times as much from the held-out photos as from learnt ones is no
+/// proof: nothing is published (docs/adr/0073).
+const OVERFIT_REFUSED: f64 = 6.0;
 
 /// The work on a version makes all that was done this many times as long.
 const LONGER: u32 = 4;
@@ -78,6 +90,8 @@ pub struct RefineCalls<'a> {
     /// Finds where the cameras stand by other means than steps, and has the networks run with them:
     /// what `remake` gives from then on is of these. `None`: nothing is found, and nothing changes.
     pub recast: &'a mut dyn FnMut() -> Result<Option<Vec<CameraToWorld>>>,
+    /// Reads the photos that only the steps learn, at this longer side at most; asked once.
+    pub more: &'a mut dyn FnMut(u32) -> Result<Option<PhotoSpool>>,
     /// Gets the share of the budget that is spent, 0..1, before each step, and may wait.
     pub pace: &'a mut dyn FnMut(f32) -> Result<()>,
     /// Gets each version that is better than the one before, with the scene that it began with.
@@ -92,7 +106,9 @@ pub struct RefineCalls<'a> {
 /// ([`RefineOptions::proof_share`]). Where its PSNR on these photos rises over that of what is
 /// served, the scene of all photos is refined in the time of the part that is left, and published.
 /// Where the proof of a further part gains less than [`RefineOptions::gain_min`] in PSNR and SSIM
-/// together ([`Judged::score`]), the work ends: so more time is never worse.
+/// together ([`Judged::score`]), the work ends: so more time is never worse. It also ends with the
+/// first version where the proof overfits ([`RefineOptions::overfit_max`]): what its held-out
+/// photos gain later, other views lose.
 ///
 /// The first scene of all photos goes on from the proof's Gaussians, and those of the held-out
 /// photos, where the proof explains these nearly as well as photos that it learnt
@@ -121,10 +137,12 @@ pub fn refined(
     let options = RefineOptions { pose_rate, ..options };
     let sized = photos.par_iter().map(|photo| at_side(photo, options.side)).collect();
     let given: Vec<CameraToWorld> = photos.iter().map(pose_of).collect();
+    let more = (calls.more)(options.side)?.and_then(MorePhotos::of);
     let mut parts = Parts {
         renderer,
         scene,
         photos: sized,
+        more,
         made: given.clone(),
         given,
         mends: false,
@@ -177,6 +195,8 @@ struct Parts<'a, 'c> {
     scene: &'a Scene,
     /// At the size at which they are learnt, with their cameras as they stand now.
     photos: Vec<PosedPhoto>,
+    /// Photos that the networks did not see.
+    more: Option<MorePhotos>,
     /// Where their cameras stood.
     given: Vec<CameraToWorld>,
     /// Where those stood that the Gaussians of the networks were made with.
@@ -235,10 +255,17 @@ impl Parts<'_, '_> {
                 Some(whole) => whole,
                 None => self.begin_whole(&proof)?,
             };
+            found.overfit = Some(made.overfit);
+            if made.overfit > OVERFIT_REFUSED {
+                break;
+            }
             let options = RefineOptions { budget: self.rest_of(part, proven.time), ..options };
             found.report = self.publish(&mut made, &mut proof, &options)?;
-            found.overfit = Some(made.overfit);
             found.versions += 1;
+            // What the held-out photos gain by more says nothing of others then.
+            if made.overfit > f64::from(self.options.overfit_max) {
+                break;
+            }
             whole = Some(made);
         }
         Ok(found)
@@ -337,7 +364,25 @@ impl Parts<'_, '_> {
         let least = LEFT_OUT_FROM.max(LEFT_OUT_FACTOR * sorted[sorted.len() / 2]);
         self.left_out = (0..shares.len()).filter(|&i| shares[i] > least).collect();
         tracing::debug!(?shares, left_out = ?self.left_out, "what photos the proof explains");
+        self.leave_out_more(proof, least)?;
         Ok(!self.left_out.is_empty())
+    }
+
+    /// The same of the photos that the networks did not see: those go of which more than `least` is
+    /// not explained.
+    fn leave_out_more(&mut self, proof: &Proof<'_>, least: f64) -> Result<()> {
+        let spent = self.spent(self.done.steps, self.done.time);
+        let Some(more) = &mut self.more else { return Ok(()) };
+        let numbers = std::mem::take(&mut more.numbers);
+        for number in numbers {
+            (self.calls.pace)(spent)?;
+            let photo = more.spool.posed(number)?;
+            let shares = unexplained(self.renderer, &proof.start, &proof.gaussians, &[photo])?;
+            if shares[0] <= least {
+                more.numbers.push(number);
+            }
+        }
+        Ok(())
     }
 
     /// The Gaussians that did not come from photos that are left out.
@@ -350,6 +395,12 @@ impl Parts<'_, '_> {
     fn parted(&self, held: &[usize]) -> (Vec<PosedPhoto>, Vec<PosedPhoto>) {
         let (learnt, held) = self.numbers(held);
         [learnt, held].map(|all| all.into_iter().map(|i| self.photos[i].clone()).collect()).into()
+    }
+
+    /// The photos that the networks did not see: none where cameras are mended, for nothing mends
+    /// theirs.
+    fn more(&self) -> Option<&MorePhotos> {
+        self.more.as_ref().filter(|_| !self.mends)
     }
 
     /// Their numbers.
@@ -598,7 +649,7 @@ impl Parts<'_, '_> {
         held: &[usize],
         options: &RefineOptions,
     ) -> Result<Stepped> {
-        let (learnt, held_out) = self.parted(held);
+        let ((learnt, held_out), more) = (self.parted(held), self.more().cloned());
         let (done, budget, plan) = (self.done, self.options.budget, options.budget);
         let begin = self.spent(done.steps, done.time);
         let end = self.spent(
@@ -609,8 +660,9 @@ impl Parts<'_, '_> {
         let mut pace = |spent: f32| (self.calls.pace)(at(spent));
         let pose_rate = if self.mends { options.pose_rate } else { 0.0 };
         let (renderer, options) = (self.renderer, RefineOptions { pose_rate, ..*options });
+        let learnt = LearntPhotos { kept: &learnt, more: more.as_ref() };
         let made =
-            refine::refine(renderer, start, gaussians, &learnt, &held_out, &options, &mut pace)?;
+            refine::refine(renderer, start, gaussians, learnt, &held_out, &options, &mut pace)?;
         if self.mends {
             self.stand(&self.numbers(held).0, &made.poses);
         }
@@ -663,13 +715,15 @@ impl Parts<'_, '_> {
 
     /// The figures where nothing is better than what is served.
     fn as_before(&self, psnr: Option<f64>) -> RefineReport {
+        let left_out = self.left_out.iter().map(|&i| self.photos[i].file.clone());
+        let more = self.more.iter().flat_map(MorePhotos::left_out);
         let gaussians = self.scene.gaussians.len() as u64;
         RefineReport {
             psnr_before: psnr,
             psnr_after: psnr,
             gaussians_before: gaussians,
             gaussians_after: gaussians,
-            left_out: self.left_out.iter().map(|&i| self.photos[i].file.clone()).collect(),
+            left_out: left_out.chain(more.map(str::to_owned)).collect(),
             ..RefineReport::default()
         }
     }
@@ -689,6 +743,7 @@ impl Parts<'_, '_> {
             psnr_before,
             psnr_after,
             gaussians_after: made.gaussians.len() as u64,
+            more_photos: self.more().map_or(0, |more| super::count(more.numbers.len())),
             cameras: self.moved(start),
             ..self.as_before(None)
         }
@@ -783,6 +838,28 @@ fn at_side(posed: &PosedPhoto, side: u32) -> PosedPhoto {
     let rgb = fitted.rgb.iter().map(|v| (v * 255.0).round() as u8).collect();
     let photo = Photo { width: scaled(width), height: scaled(height), rgb, valid: fitted.valid };
     PosedPhoto { photo, camera: fitted.camera, ..posed.clone() }
+}
+
+/// Reads the photos of an upload that only the steps learn, at this longer side at most, onto a
+/// disk: in the folder `dir`, or where the system keeps such files. `pace` is called before each
+/// and may wait; its error ends the work.
+///
+/// # Errors
+/// Those of [`photos::more`] and [`PhotoSpool`], and of `pace`.
+pub fn spooled(
+    upload: &Upload,
+    mode: CamerasMode,
+    side: u32,
+    limits: &Limits,
+    dir: Option<&Path>,
+    pace: &mut dyn FnMut() -> Result<()>,
+) -> Result<PhotoSpool> {
+    let (mut spool, never) = (PhotoSpool::new(dir)?, AtomicBool::new(false));
+    photos::more(upload, mode, side, limits, &never, |photo| {
+        pace()?;
+        spool.push(photo)
+    })?;
+    Ok(spool)
 }
 
 /// What refinement begins with: `learnt` and `one_set` were made of the photos of `scene` less

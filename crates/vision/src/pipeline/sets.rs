@@ -4,6 +4,7 @@ use crate::{
     photos,
     scene::{
         CamerasReport, Photo, PosedPhoto, SceneCamera, Stage, StageTime, UnposedPhoto, Warning,
+        WarningCode,
     },
 };
 
@@ -26,6 +27,12 @@ impl PhotoSet {
     pub fn given(photos: Vec<PosedPhoto>, warnings: Vec<Warning>, read_ms: f64) -> Self {
         let stages = vec![read_time(read_ms)];
         Self { photos, warnings, stages, cameras: CamerasReport::default() }
+    }
+
+    /// Whether the upload has photos for the steps of a refinement alone.
+    #[must_use]
+    pub fn has_more(&self) -> bool {
+        self.warnings.iter().any(|warning| warning.code == WarningCode::PhotosForSteps)
     }
 
     /// Bytes of the pixels.

@@ -18,7 +18,13 @@
 //! **One set.** A scene that comes in may be served in layers and with magnification. What comes
 //! out is plain: the same Gaussians for every view and for other programs.
 
-use std::time::{Duration, Instant};
+mod half;
+mod spool;
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -27,16 +33,21 @@ use segsplat_render::{
     compare::psnr,
     plan::{default_near, served, widened},
     train::{
-        HostTrainer, PoseRates, Trainer, TrainingPhoto, TrainingSet, TrainingStep, checked,
-        photo_loss, unit,
+        HostTrainer, PhotoSource, PoseRates, StreamedPhoto, Trainer, TrainingPhoto, TrainingSet,
+        TrainingStep, checked, photo_loss, unit,
     },
 };
 
+pub use self::spool::{MorePhotos, PhotoSpool};
+use self::{
+    half::{halved, halved_camera},
+    spool::Halved,
+};
 pub use segsplat_render::train::LearningRates;
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Camera, CameraToWorld, Gaussians, Intrinsics, Photo, PosedPhoto, RefineReport, Scene},
+    scene::{Camera, CameraToWorld, Gaussians, Photo, PosedPhoto, RefineReport, Scene},
 };
 
 /// Fewest photos of which one is held out.
@@ -200,6 +211,21 @@ pub struct RefinedVersion {
     pub poses: Vec<CameraToWorld>,
 }
 
+/// Photos to learn from.
+#[derive(Clone, Copy, Debug)]
+pub struct LearntPhotos<'a> {
+    /// Those that are in memory.
+    pub kept: &'a [PosedPhoto],
+    /// Those that are on disk; their cameras stay where they are.
+    pub more: Option<&'a MorePhotos>,
+}
+
+impl<'a> From<&'a [PosedPhoto]> for LearntPhotos<'a> {
+    fn from(kept: &'a [PosedPhoto]) -> Self {
+        Self { kept, more: None }
+    }
+}
+
 /// What steps made.
 #[derive(Clone, Debug)]
 pub struct Stepped {
@@ -211,7 +237,7 @@ pub struct Stepped {
     pub time: Duration,
     /// How they show the held-out photos; `None` without such photos.
     pub judged: Option<Judged>,
-    /// Where the cameras of the learnt photos stand.
+    /// Where the cameras of the learnt photos that are kept stand.
     pub poses: Vec<CameraToWorld>,
 }
 
@@ -402,11 +428,12 @@ pub fn refine(
     renderer: &dyn DifferentiableRenderer,
     start: &Scene,
     gaussians: &Gaussians,
-    learnt: &[PosedPhoto],
+    learnt: LearntPhotos<'_>,
     held_out: &[PosedPhoto],
     options: &RefineOptions,
     pace: &mut dyn FnMut(f32) -> Result<()>,
 ) -> Result<Stepped> {
+    let LearntPhotos { kept: learnt, more } = learnt;
     let over_0 = [options.gaussians_first, options.gaussians_max, options.batch];
     if options.prune_every == 0 || over_0.contains(&0) {
         return Err(Error::invalid("refine: batch, prune_every, gaussians_* must be over 0"));
@@ -419,18 +446,27 @@ pub fn refine(
         return Ok(Stepped { gaussians: gaussians.clone(), steps, time, judged, poses });
     }
     // Behind the photos their smaller copies.
-    let coarse = match options.coarse_share > 0.0 {
+    let has_room = |camera: &Camera| {
+        let lens = camera.intrinsics;
+        lens.width.max(lens.height) / 2 >= options.coarse_side_min
+            && lens.width.min(lens.height) > 1
+    };
+    let all_have = more.is_none_or(|more| more.cameras().all(has_room));
+    let coarse = match options.coarse_share > 0.0 && all_have {
         true => coarse_copies(learnt, options),
         false => Vec::new(),
     };
     let (ssim_share, gaussians_max) = (options.ssim_share, most_gaussians(learnt, options));
     let photos = [training_photos(start, learnt), training_photos(start, &coarse)].concat();
-    let set = TrainingSet { gaussians, photos, ssim_share, gaussians_max };
     let is_few = held_out.is_empty() && learnt.len() < HOLDS_OUT_FROM;
+    let has_coarse = !coarse.is_empty();
+    let streamed = more.map_or_else(Vec::new, |more| streamed(start, more, learnt.len()));
     let course = Course {
         is_few,
-        photos: learnt.len(),
-        coarse_share: if coarse.is_empty() { 0.0 } else { options.coarse_share },
+        kept: learnt.len(),
+        streamed: more.map_or(0, |more| more.numbers.len()),
+        has_coarse,
+        coarse_share: if has_coarse { options.coarse_share } else { 0.0 },
         gaussians: gaussians.len(),
         gaussians_max,
         rates: rates_of(start, options),
@@ -440,10 +476,12 @@ pub fn refine(
         random: options.seed,
         grows_at: 0,
     };
+    let set = TrainingSet { gaussians, photos, streamed, ssim_share, gaussians_max };
     with_trainer(renderer, &set, options, |trainer| {
         let (steps, time) = course.clone().run(trainer, pace)?;
         let judged = judged(&held_out, |camera| trainer.render(&plain_view(start, camera)))?;
-        let (gaussians, poses) = (trainer.gaussians()?, trainer.poses()?);
+        let (gaussians, mut poses) = (trainer.gaussians()?, trainer.poses()?);
+        poses.truncate(learnt.len());
         Ok(Stepped { gaussians, steps, time, judged, poses })
     })
 }
@@ -469,7 +507,7 @@ pub fn aligned(
     let coarse = coarse_copies(photos, options);
     let photos = training_photos(start, if coarse.is_empty() { photos } else { &coarse });
     let (count, ssim_share, gaussians_max) = (photos.len(), options.ssim_share, gaussians.len());
-    let set = TrainingSet { gaussians, photos, ssim_share, gaussians_max };
+    let set = TrainingSet { gaussians, photos, streamed: Vec::new(), ssim_share, gaussians_max };
     let poses = pose_rates(start, options);
     with_trainer(renderer, &set, options, |trainer| {
         for turn in 0..steps {
@@ -563,6 +601,23 @@ fn training_photos<'a>(start: &Scene, photos: &'a [PosedPhoto]) -> Vec<TrainingP
     photos.iter().enumerate().map(of).collect()
 }
 
+/// Photos on disk for a trainer, then the same at half their size. Their cameras come after those
+/// of the photos that are kept.
+fn streamed(start: &Scene, more: &MorePhotos, kept: usize) -> Vec<StreamedPhoto> {
+    let whole: Arc<dyn PhotoSource> = more.spool.clone();
+    let half: Arc<dyn PhotoSource> = Arc::new(Halved(Arc::clone(&more.spool)));
+    let of = |source: &Arc<dyn PhotoSource>, camera: fn(Camera) -> Camera| {
+        let photo = |(at, (&number, of)): (usize, (&usize, &Camera))| StreamedPhoto {
+            source: Arc::clone(source),
+            number,
+            request: plain_view(start, camera(*of)),
+            pose: kept + at,
+        };
+        more.numbers.iter().zip(more.cameras()).enumerate().map(photo).collect::<Vec<_>>()
+    };
+    [of(&whole, |camera| camera), of(&half, halved_camera)].concat()
+}
+
 /// How near what `gaussians` show, over what is behind those of `start`, is to photos that are not
 /// in them; `None` of no photo.
 ///
@@ -639,32 +694,12 @@ fn coarse_copies(photos: &[PosedPhoto], options: &RefineOptions) -> Vec<PosedPho
     if least < options.coarse_side_min {
         return Vec::new();
     }
-    photos.par_iter().map(halved).collect()
-}
-
-/// A photo of half the size: the mean of each two by two pixels. One is known where all four are.
-fn halved(posed: &PosedPhoto) -> PosedPhoto {
-    let (photo, lens) = (&posed.photo, posed.camera.intrinsics);
-    let (width, height) = (photo.width / 2, photo.height / 2);
-    let four = |i: usize| {
-        let (x, y) = (2 * (i % width as usize), 2 * (i / width as usize));
-        let at = y * photo.width as usize + x;
-        [at, at + 1, at + photo.width as usize, at + photo.width as usize + 1]
+    let half = |posed: &PosedPhoto| PosedPhoto {
+        photo: halved(&posed.photo),
+        camera: halved_camera(posed.camera),
+        ..posed.clone()
     };
-    let mean = |i: usize| -> [u8; 3] {
-        let sum = |c: usize| four(i).iter().map(|at| u16::from(photo.rgb[3 * at + c])).sum::<u16>();
-        std::array::from_fn(|c| (sum(c) + 2).div_euclid(4) as u8)
-    };
-    let pixels = 0..width as usize * height as usize;
-    let rgb = pixels.clone().flat_map(mean).collect();
-    let known = |valid: &Vec<bool>| -> Vec<bool> {
-        pixels.map(|i| four(i).iter().all(|at| valid[*at])).collect()
-    };
-    let valid = photo.valid.as_ref().map(known);
-    let [fx, fy, cx, cy] = [lens.fx, lens.fy, lens.cx, lens.cy].map(|v| v / 2.0);
-    let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
-    let camera = Camera { intrinsics, ..posed.camera };
-    PosedPhoto { photo: Photo { width, height, rgb, valid }, camera, ..posed.clone() }
+    photos.par_iter().map(half).collect()
 }
 
 /// Most Gaussians that such photos can tell apart.
@@ -687,8 +722,11 @@ struct Course<'a> {
     options: &'a RefineOptions,
     /// Whether nothing tells when to stop.
     is_few: bool,
-    /// Photos to learn; behind them the trainer has their smaller copies, where they are used.
-    photos: usize,
+    /// Photos that the trainer keeps; behind them it has their smaller copies, where they are used.
+    kept: usize,
+    /// Photos that it streams, behind those; behind them their smaller copies.
+    streamed: usize,
+    has_coarse: bool,
     coarse_share: f32,
     /// Gaussians now, and most of them.
     gaussians: usize,
@@ -742,34 +780,44 @@ impl Course<'_> {
             return None;
         }
         self.grows_at = steps + GROWS_EVERY;
-        let first = self.first_copy(spent);
-        let photos = shuffled(self.photos, &mut self.random).into_iter().take(GROWTH_PHOTOS);
+        let photos = shuffled(self.photos(), &mut self.random).into_iter().take(GROWTH_PHOTOS);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share")]
         let more = (self.gaussians as f32 * growth) as usize;
         let until = self.gaussians_max.min(self.gaussians + more);
-        Some((photos.map(|i| first + i).collect(), until))
+        Some((photos.map(|i| self.copy_of(i, spent)).collect(), until))
     }
 
     /// Photos of the next step: all of them by turns, each time in another order.
     fn next_photos(&mut self, spent: f32) -> Vec<usize> {
-        let first = self.first_copy(spent);
+        let batch = self.options.batch;
         let next = |_| {
             if self.order.is_empty() {
-                self.order = shuffled(self.photos, &mut self.random);
+                self.order = shuffled(self.photos(), &mut self.random);
             }
-            first + self.order.pop().unwrap_or_default()
+            let next = self.order.pop().unwrap_or_default();
+            self.copy_of(next, spent)
         };
-        (0..self.options.batch).map(next).collect()
+        (0..batch).map(next).collect()
     }
 
-    /// Number of the first photo in the size that is learnt now.
-    fn first_copy(&self, spent: f32) -> usize {
-        if spent < self.coarse_share { self.photos } else { 0 }
+    /// All photos to learn.
+    fn photos(&self) -> usize {
+        self.kept + self.streamed
+    }
+
+    /// The trainer's number of a photo in the size that is learnt now.
+    fn copy_of(&self, photo: usize, spent: f32) -> usize {
+        let is_coarse = spent < self.coarse_share;
+        let Some(streamed) = photo.checked_sub(self.kept) else {
+            return if is_coarse { self.kept + photo } else { photo };
+        };
+        let first = self.kept * if self.has_coarse { 2 } else { 1 };
+        first + streamed + if is_coarse { self.streamed } else { 0 }
     }
 
     /// How the step after so many moves what it moves.
     fn step(&self, steps: u32, spent: f32) -> TrainingStep {
-        let expected = steps as f32 / spent / self.photos as f32;
+        let expected = steps as f32 / spent / self.photos() as f32;
         let rate = LAST_RATE.powf(spent) * if self.is_few { 1.0 } else { rate_factor(expected) };
         let prunes = (steps + 1).is_multiple_of(self.options.prune_every);
         TrainingStep {

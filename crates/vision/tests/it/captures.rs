@@ -10,7 +10,7 @@ use std::{
 use segsplat_core::{
     error::{Error, ErrorCode},
     limits::Limits,
-    scene::{PosedPhoto, Upload, UploadFile, WarningCode},
+    scene::{CamerasMode, PosedPhoto, Upload, UploadFile, Warning, WarningCode},
 };
 use segsplat_testing::captures::{self, LAYOUTS, zipped};
 use segsplat_vision::{
@@ -274,16 +274,44 @@ fn of_too_many_photos_the_best_are_taken_and_named() {
     };
     let many: Vec<PosedPhoto> = (0..70).map(one).collect();
     let pngs = vec![pngs[0].clone(); 70];
+    let never = AtomicBool::new(false);
+    let limits = Limits { photos_max: 68, ..Limits::default() };
     for layout in ["transforms", "colmap_bin"] {
-        let got = from_archive(zipped(&captures::write(layout, &many, &pngs), ""));
+        let archive = Some(zipped(&captures::write(layout, &many, &pngs), ""));
+        let upload = Upload { archive, ..Upload::default() };
+        let got = photos::read_until(&upload, &limits, &never).unwrap();
         assert_eq!(got.photos.len(), 64, "{layout}");
-        let [warning] = &got.warnings[..] else { panic!("{layout}: {:?}", got.warnings) };
-        assert_eq!((warning.code, warning.value), (WarningCode::PhotosUnused, 6.0));
-        assert!(warning.message.contains("64 of these 70 photos"), "{}", warning.message);
-        let named: Vec<&str> = warning.message.split('"').skip(1).step_by(2).collect();
-        assert_eq!(named.len(), 4, "{}", warning.message);
-        assert!(got.photos.iter().all(|photo| !named.contains(&&*photo.file)), "{named:?}");
-        assert!(got.photos.is_sorted_by_key(|photo| photo.file.clone()), "in the cameras' order");
+        let [unused, more] = &got.warnings[..] else { panic!("{layout}: {:?}", got.warnings) };
+        assert_eq!((unused.code, unused.value), (WarningCode::PhotosUnused, 2.0));
+        assert!(unused.message.contains("68 of these 70 photos"), "{}", unused.message);
+        assert_eq!((more.code, more.value), (WarningCode::PhotosForSteps, 4.0));
+        assert!(more.message.contains("64 of these 68 photos"), "{}", more.message);
+        let named = |warning: &Warning| -> Vec<String> {
+            warning.message.split('"').skip(1).step_by(2).map(str::to_owned).collect()
+        };
+        let (left_out, for_steps) = (named(unused), named(more));
+        assert_eq!([left_out.len(), for_steps.len()], [2, 4]);
+        let mut all: Vec<String> = got.photos.iter().map(|photo| photo.file.clone()).collect();
+        assert!(all.is_sorted(), "in the cameras' order");
+        all.extend([left_out, for_steps.clone()].concat());
+        all.sort();
+        all.dedup();
+        assert_eq!(all.len(), 70, "{layout}: each photo is in one place");
+        let (mut read, auto) = (Vec::new(), CamerasMode::Auto);
+        photos::more(&upload, auto, 24, &limits, &never, |photo| {
+            let stem = photo.file.trim_end_matches(".png");
+            let number: usize = stem[stem.len() - 4..].parse().unwrap();
+            let [got, want] = [photo, &many[number]].map(|it| it.camera.camera_to_world);
+            assert!(got.center().distance(want.center()) < 1e-5, "{layout}: {}", photo.file);
+            assert!(got.turn_to(&want) < 1e-5, "{layout}: {}", photo.file);
+            assert_eq!((photo.photo.width, photo.photo.height), (24, 18), "{layout}");
+            let focal = photo.camera.intrinsics.fx / posed[0].camera.intrinsics.fx;
+            assert!((focal - 0.5).abs() < 1e-9, "{layout}: the lens is of the size");
+            read.push(photo.file.clone());
+            Ok(())
+        })
+        .unwrap();
+        assert_eq!(read, for_steps, "{layout}");
     }
 }
 

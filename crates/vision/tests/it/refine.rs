@@ -30,9 +30,9 @@ use segsplat_vision::{
         refinement::{self, RefineCalls, Refined, version_of},
     },
     refine::{
-        HOLDS_OUT_FROM, Judged, RefineBudget, RefineOptions, RefinedVersion, Stepped,
-        UNWATCHED_STEPS_MAX, differences, held_out, judged_as_served, rate_factor, ready, refine,
-        split,
+        HOLDS_OUT_FROM, Judged, LearntPhotos, MorePhotos, PhotoSpool, RefineBudget, RefineOptions,
+        RefinedVersion, Stepped, UNWATCHED_STEPS_MAX, differences, held_out, judged_as_served,
+        rate_factor, ready, refine, split,
     },
 };
 
@@ -119,7 +119,8 @@ fn refined_by(
     let (learnt, out) = split(photos, &held_out(photos.len()));
     let scene = scene(start, 3.0);
     let gaussians = ready(&scene, start, options).expect("Gaussians");
-    refine(renderer, &scene, &gaussians, &learnt, &out, options, &mut |_| Ok(())).expect("refined")
+    let learnt = learnt[..].into();
+    refine(renderer, &scene, &gaussians, learnt, &out, options, &mut |_| Ok(())).expect("refined")
 }
 
 fn cpu() -> CpuRenderer {
@@ -204,6 +205,39 @@ fn a_disturbed_scene_gets_better_on_photos_that_were_held_out() {
     assert_eq!((again.steps, again.judged), (best.steps, best.judged));
 }
 
+#[test]
+fn photos_on_disk_are_learnt_beside_the_others() {
+    let (truth, photos) = captured(12);
+    let (kept, others) = photos.split_at(8);
+    let mut spool = PhotoSpool::new(None).expect("a file");
+    others.iter().for_each(|photo| spool.push(photo).expect("room"));
+    let more = MorePhotos::of(spool).expect("photos");
+    let start = disturbed(&truth);
+    let scene = scene(&start, 3.0);
+    let budget = RefineBudget::steps(160);
+    let options = RefineOptions {
+        budget,
+        coarse_share: 0.4,
+        coarse_side_min: 20,
+        growth: 0.0,
+        ..RefineOptions::default()
+    };
+    let gaussians = ready(&scene, &start, &options).expect("Gaussians");
+    let away = |more: Option<&MorePhotos>| {
+        let learnt = LearntPhotos { kept, more };
+        let mut pace = |_: f32| Ok(());
+        let made =
+            refine(&cpu(), &scene, &gaussians, learnt, &[], &options, &mut pace).expect("refined");
+        assert_eq!((made.steps, made.poses.len()), (160, kept.len()));
+        let all = differences(&cpu(), &scene, &made.gaussians, others).expect("views");
+        all.iter().sum::<f64>() / all.len() as f64
+    };
+    let (without, with) = (away(None), away(Some(&more)));
+    println!("{without:.4} away without them, {with:.4} with them");
+    assert!(with < 0.8 * without, "{with} away, {without} without them");
+    assert_eq!(with, away(Some(&more)), "the same steps");
+}
+
 /// A whole refinement, and each of its versions with what it began with.
 struct Whole {
     found: Refined,
@@ -257,7 +291,8 @@ fn refined_whole(
     };
     let pace = &mut |_: f32| Ok(());
     let recast = &mut || Ok(None);
-    let calls = RefineCalls { remake: &mut remake, recast, pace, publish: &mut publish };
+    let more = &mut |_| Ok(None);
+    let calls = RefineCalls { remake: &mut remake, recast, more, pace, publish: &mut publish };
     let found = refinement::refined(renderer, &scene, photos, options, calls);
     Whole { found: found.expect("refined"), versions }
 }
@@ -299,6 +334,29 @@ fn a_first_version_comes_soon_and_others_only_where_they_gain() {
     assert!((sharp - soft - 0.4).abs() < 1e-9);
     let worse = refined(&RefineOptions { rate: -1.0, ..steps_of(640, 40) });
     assert!(worse.versions.is_empty() && worse.found.versions == 0, "steps that lead away");
+}
+
+#[test]
+fn a_proof_that_overfits_ends_the_work_and_one_without_worth_publishes_nothing() {
+    let (_, mut photos) = captured(9);
+    let versions = |photos: &[PosedPhoto], overfit_max: f32, first_steps: u32| {
+        let options = RefineOptions { overfit_max, ..steps_of(640, first_steps) };
+        let whole = refined_whole(&cpu(), photos, &options, &|| ());
+        (whole.found.versions, whole.found.overfit.expect("a better proof"))
+    };
+    let (all, overfit) = versions(&photos, 1.5, 40);
+    assert_eq!((all, overfit < 1.5), (3, true), "{overfit}");
+    assert_eq!(versions(&photos, 0.9 * overfit as f32, 40), (1, overfit), "the first stays");
+    // Held-out photos that nothing explains.
+    let mut random = Random(3);
+    for at in held_out(photos.len()) {
+        for value in &mut photos[at].photo.rgb {
+            let noise = if random.range(0.0, 1.0) < 0.5 { -100 } else { 100 };
+            *value = (i32::from(*value) + noise).clamp(0, 255) as u8;
+        }
+    }
+    let (none, overfit) = versions(&photos, 1.5, 160);
+    assert!(none == 0 && overfit > 6.0, "{none} versions, {overfit}");
 }
 
 #[test]
@@ -524,7 +582,7 @@ fn a_cancelled_refinement_stops_and_odd_input_is_taken_or_refused() {
         };
         let scene = scene(start, f64::NAN);
         let gaussians = ready(&scene, start, options)?;
-        refine(&cpu, &scene, &gaussians, photos, &[], options, &mut pace)
+        refine(&cpu, &scene, &gaussians, photos.into(), &[], options, &mut pace)
     };
     let options = RefineOptions { budget: RefineBudget::steps(30), ..RefineOptions::default() };
     let told = run(&truth, &photos, &options, true).expect_err("cancelled");
