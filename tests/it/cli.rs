@@ -277,6 +277,50 @@ fn bench_says_the_time_of_a_view_and_its_error() {
     assert_eq!(told["renderer"], "cpu");
 }
 
+#[cfg(unix)]
+#[test]
+fn a_video_becomes_photos_where_ffmpeg_is_there() {
+    use std::os::unix::fs::PermissionsExt;
+    if !with_network() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (film, programs) = (folder.path().join("Film.MP4"), folder.path().join("bin"));
+    std::fs::write(&film, "").unwrap();
+    std::fs::create_dir(&programs).unwrap();
+    let asked = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_segsplat"));
+        command.current_dir(crate::common::root()).env("PATH", &programs);
+        let output = command.args(["cameras", text(&film)]).output().unwrap();
+        (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    let exit = |code: ErrorCode| Some(i32::from(code.row().exit));
+    let (code, said) = asked();
+    assert_eq!(code, exit(ErrorCode::InvalidRequest), "{said}");
+    assert!(said.contains("Film.MP4: it is a video, and there is no ffmpeg; install"), "{said}");
+    // Stands for the program: three seconds that do not move, then the frames that are asked for.
+    let program = programs.join("ffmpeg");
+    let script = r#"#!/bin/sh
+        case "$*" in
+        *rawvideo*) /usr/bin/head -c $((320 * 240 * 30)) /dev/zero;;
+        *"eq(n\,0)+eq(n\,2)+"*)
+            for i in 0 1 2 3 4 5 6 7 8 9 a b c d e f; do printf '\377\330\377\331'; done;;
+        esac
+    "#;
+    std::fs::write(&program, script).unwrap();
+    std::fs::set_permissions(&program, PermissionsExt::from_mode(0o755)).unwrap();
+    let (code, said) = loop {
+        match asked() {
+            // A child that another test starts meanwhile holds the program open.
+            (_, said) if said.contains("does not start") => std::thread::yield_now(),
+            other => break other,
+        }
+    };
+    // They came as photos, named by their times; pictures they are not.
+    assert_eq!(code, exit(ErrorCode::PhotoUnreadable), "{said}");
+    assert!(said.contains("00000.00s.jpg"), "{said}");
+}
+
 #[test]
 fn photos_without_cameras_get_them_and_a_file_of_them() {
     if !with_network() {
