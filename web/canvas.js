@@ -106,18 +106,12 @@ function over(width, height) {
   }
   state.words.forEach((word, k) => {
     for (const part of word.parts.slice(0, BOXES)) {
-      const { center, axes, size } = part;
       pen.globalAlpha = strengthOf(part, word);
-      const corner = (i) =>
-        axes.reduce((p, axis, j) => add(p, axis, ((i >> j) & 1 ? 0.5 : -0.5) * size[j]), center);
-      const edges = [];
-      for (let i = 0; i < 8; i++)
-        for (let j = 0; j < 3; j++)
-          if (!((i >> j) & 1)) edges.push([corner(i), corner(i | (1 << j))]);
-      draw(css(k), edges);
+      draw(css(k), edgesOf(part));
     }
   });
   pen.globalAlpha = 1;
+  for (const [color, boxes] of outlines()) draw(color, boxes.flatMap(edgesOf));
   if (state.marks.length) {
     if (state.marks.length > 1) draw('#ff0', [state.marks]);
     for (const mark of state.marks) {
@@ -131,6 +125,17 @@ function over(width, height) {
       pen.stroke();
     }
   }
+}
+// The eight corners of a box, and its twelve edges.
+const cornersOf = ({ center, axes, size }) =>
+  Array.from({ length: 8 }, (_, i) =>
+    axes.reduce((p, axis, j) => add(p, axis, ((i >> j) & 1 ? 0.5 : -0.5) * size[j]), center),
+  );
+function edgesOf(box) {
+  const corners = cornersOf(box);
+  return corners.flatMap((corner, i) =>
+    [1, 2, 4].filter((bit) => !(i & bit)).map((bit) => [corner, corners[i | bit]]),
+  );
 }
 // How strongly a part is drawn: those that fit less than the best one are dimmer.
 const strengthOf = (part, word) => {

@@ -83,12 +83,14 @@ async function select(point, entry, more) {
   show({
     text: t('thing', { n: state.things }),
     isThing: true,
+    point,
     scores,
     entries: [found.entry],
     gaussians: found.gaussians,
     parts: [{ ...found, score: 1 }],
     score: 1,
   });
+  if (!state.alone) chooseWord(state.words.at(-1));
   const [wide, deep, high] = found.size.map(lengthOf);
   $('picked').append(' ', t('pick.size', { wide, high, deep }), ' ');
 }
@@ -98,6 +100,7 @@ function letGo() {
   state.words = state.words.filter((word) => !word.isThing);
   if (state.measuring) press('measure', 'measuring');
   told('');
+  choose(null);
   showWords();
 }
 
@@ -120,6 +123,7 @@ function measured() {
   truth.onchange = () => {
     metres.give(id, Number(truth.value) / units);
     measured();
+    remember();
   };
   $('picked').append(' ', make('label', {}, t('measure.truth'), ' ', truth, ' m'));
 }
@@ -168,6 +172,27 @@ async function find(text) {
   );
 }
 
+// Asks for the words that are shown again, of a scene that was edited; what was clicked is let go.
+async function askAgain() {
+  letGo();
+  state.known = [];
+  const { id } = state.scene,
+    texts = textsShown();
+  if (!texts.length) return;
+  const body = JSON.stringify({ texts });
+  const answer = await server.json(`/v1/scenes/${id}/query`, { method: 'POST', body });
+  if (state.scene?.id !== id) return;
+  state.known = answer.results;
+  state.words = state.words
+    .map((word) => {
+      const found = answer.results.find((one) => one.text === word.text);
+      return found ? { ...word, ...found, score: Math.max(0, ...found.scores) } : word;
+    })
+    // What an edit took away dims the scene no more.
+    .filter((word) => word.gaussians);
+  showWords();
+}
+
 // One more word; the oldest goes where there is no colour left.
 function show(word) {
   if (state.words.length === TINTS.length) state.words.shift();
@@ -175,14 +200,9 @@ function show(word) {
   showWords();
 }
 
-// The first text has the semantics made, and their stages come as events. The events of a finished
-// scene end at once, which it is until the question has come: they are asked for again until it is
-// answered.
-async function watchUnderstanding(id, signal) {
-  while (!signal.aborted) {
-    await server.watch(id, progress, signal).catch(() => {});
-    await new Promise((go) => setTimeout(go, 200));
-  }
+// The first text has the semantics made, and their stages come as events.
+function watchUnderstanding(id, signal) {
+  server.watch(id, progress, signal, { semantics: true }).catch(() => {});
 }
 
 // What was measured of the word of an answer: { trust, word, words } with how many words were. Null
@@ -238,9 +258,12 @@ function chip(word, k) {
   const more = word.parts.length - DOTS;
   const take = make('button', { type: 'button', className: 'server', textContent: '↓' });
   take.onclick = () => exportAs('ply', word.text).catch(failed);
+  const change = make('button', { type: 'button', className: 'server', textContent: '✎' });
+  change.onclick = () => chooseWord(word);
   const remove = make('button', { type: 'button', textContent: '×' });
   remove.onclick = () => {
     state.words.splice(k, 1);
+    if (chosen?.name === word.text) choose(null);
     if (word.isThing) told('');
     showWords();
     say(shown());
@@ -255,6 +278,8 @@ function chip(word, k) {
     make('span', { className: 'parts' }, ...parts, more > 0 ? `+${more}` : ''),
     labelled(remove, t('remove', { text: word.text })),
   );
+  if (word.gaussians)
+    item.lastChild.before(labelled(change, t('act.on', { text: word.text })));
   if (word.found) item.lastChild.before(labelled(take, t('word.take', { text: word.text })));
   item.classList.toggle('missing', !word.gaussians);
   return item;

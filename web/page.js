@@ -94,6 +94,7 @@ function bindWays() {
 function bind() {
   bindView();
   bindTools();
+  bindEdits();
   bindWays();
   for (const id of ['side', 'tools']) $(`${id}-fold`).onclick = () => fold(id);
   $('ask').onsubmit = (e) => {
@@ -132,7 +133,7 @@ function bind() {
 }
 
 async function follow() {
-  const { scene, name, camera, words, kind, embedded } = fromLink();
+  const { scene, name, metre, camera, words, kind, embedded } = fromLink();
   state.embedded = embedded;
   document.body.classList.toggle('embedded', embedded);
   state.kind = kind;
@@ -142,6 +143,7 @@ async function follow() {
     return;
   }
   if (scene && name && !names.of(scene)) names.give(scene, name);
+  if (scene && metre && !metres.of(scene)) metres.give(scene, metre);
   if (scene) await open(scene, camera, words);
 }
 

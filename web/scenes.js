@@ -40,7 +40,7 @@ function row(item) {
   );
   button.dataset.id = id;
   button.setAttribute('aria-current', String(state.scene?.id === id));
-  if (item.state === 'done') pictures.of(button.firstChild, id, item.version, 0);
+  if (item.state === 'done') pictures.of(button.firstChild, id, `${item.version}.${edits.turn}`, 0);
   const remove = make('button', {
     type: 'button',
     textContent: '×',
@@ -108,7 +108,7 @@ function strip({ id, cameras }) {
   const stops = cameras.map((photo, i) => {
     const small = make('span', { className: 'small', textContent: i + 1 });
     const button = make('button', { type: 'button', onclick: () => flyTo(framing(photo)) }, small);
-    if (!state.alone) pictures.of(small, id, state.version, i);
+    if (!state.alone) pictures.of(small, id, `${state.version}.${edits.turn}`, i);
     return make('li', {}, labelled(button, photo.file));
   });
   $('stops').replaceChildren(...stops);
@@ -196,6 +196,7 @@ async function open(id, camera, words = []) {
   const isGrowing = scene.refinement.state === 'running';
   await load(id, camera, isGrowing && scene.report.gaussians <= COMPARED);
   about(scene);
+  await readEdits(id);
   if (isGrowing) followVersions(id, scene.version, signal).catch(() => {});
   for (const b of $('scenes').querySelectorAll('button[data-id]'))
     b.setAttribute('aria-current', String(b.dataset.id === id));
@@ -206,6 +207,7 @@ async function open(id, camera, words = []) {
 function forget() {
   Object.assign(state, { words: [], known: [], kept: [], marks: [], things: 0 });
   versions.forget();
+  edits.forget();
   for (const id of ['words', 'picked', 'stops']) $(id).replaceChildren();
   showKept();
 }
@@ -303,12 +305,18 @@ async function followVersions(id, shown, signal) {
     newest = version;
     takeNewest().catch(failed);
   };
-  await server.watch(id, heard, signal, true);
+  await server.watch(id, heard, signal, { versions: true });
   if (!signal.aborted) about(await server.json(`/v1/scenes/${id}`));
 }
 
-// Takes a version in place of the one that is shown, once it is here whole: camera and words stay.
+// Takes a version in place of the one that is shown.
 async function takeVersion(id, signal) {
+  if (await takeScene(id, signal)) say(t('better', { shown: shown() }));
+}
+
+// Takes the scene as it is now in place of what is shown, once it is here whole: camera and words
+// stay. Gives whether it did.
+async function takeScene(id, signal) {
   const answer = await server.call(`/v1/scenes/${id}/export?format=packed`, { signal });
   const taken = { head: null, parts: [] };
   await readPacked(
@@ -319,12 +327,12 @@ async function takeVersion(id, signal) {
     },
     (first, words) => taken.parts.push([first, words]),
   );
-  if (signal.aborted || state.filming) return;
+  if (signal.aborted || state.filming) return false;
   versions.after = taken;
   versions.show(false);
   if (!versions.before) versions.after = null;
   $('before').hidden = !versions.before;
-  say(t('better', { shown: shown() }));
+  return true;
 }
 
 // How many Gaussians there are, and which of them where the device has no room for all.

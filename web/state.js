@@ -111,15 +111,15 @@ class Kept {
   }
 }
 // Names, given by hand or by what was dropped, and metres a unit of the capture. A link carries
-// the name.
+// both.
 const names = new Kept('names'),
   metres = new Kept('metres');
 
+// Metres a unit; 1 where no true length was given.
+const metre = () => Number(metres.of(state.scene.id)) || 1;
 // A length of the scene as it is said: in metres where a true length was given.
-const lengthOf = (units) => {
-  const metre = metres.of(state.scene.id);
-  return metre ? `${(units * metre).toPrecision(3)} m` : units.toPrecision(3);
-};
+const lengthOf = (units) =>
+  `${(units * metre()).toPrecision(3)}${metres.of(state.scene.id) ? ' m' : ''}`;
 
 // ---- the link ---------------------------------------------------------------------------------
 // The scene, its name, the pose, the words and the picture are in the fragment, which no server
@@ -130,6 +130,7 @@ function fragment() {
   if (!state.alone) {
     parts.set('scene', state.scene.id);
     if (names.of(state.scene.id)) parts.set('name', names.of(state.scene.id));
+    if (metres.of(state.scene.id)) parts.set('metre', metre().toPrecision(6));
   }
   parts.set('pose', [...eye, ...target, ...up, fov].map((v) => Number(v.toPrecision(9))).join(','));
   for (const text of textsShown()) parts.append('text', text);
@@ -157,6 +158,7 @@ function fromLink() {
   return {
     scene: parts.get('scene'),
     name: parts.get('name') || '',
+    metre: Math.max(0, Number(parts.get('metre'))) || 0,
     camera,
     words: parts.getAll('text').slice(0, TINTS.length),
     kind: Math.max(0, KINDS.indexOf(parts.get('kind'))),

@@ -280,6 +280,60 @@ const TABLE = {
   ],
   'measure.truth': ['In truth it is', 'In Wahrheit sind es', '实际长度为'],
 
+  // Edits.
+  edits: ['Edits', 'Änderungen', '编辑'],
+  'edits.none': [
+    'Find or click a thing, then delete, move or recolour it.',
+    'Finden Sie ein Ding oder klicken Sie es an; dann löschen, bewegen oder färben Sie es.',
+    '查找或点击物体，然后删除、移动或改色。',
+  ],
+  'edits.doing': ['editing …', 'wird geändert …', '正在编辑…'],
+  'edits.whole': [
+    'The scene is as it was made.',
+    'Die Szene ist so, wie sie entstand.',
+    '场景已恢复原样。',
+  ],
+  'edits.hole': [
+    'What was behind was not seen: {share} % of the photos shows nothing now.',
+    'Was dahinter war, ist auf keinem Foto: {share} % der Fotos zeigen dort nun nichts.',
+    '其后方未被拍到：照片中有 {share} % 现在没有内容。',
+  ],
+  'edits.box': ['Box', 'Quader', '框'],
+  'edits.up': ['Apply edit {n} earlier', 'Änderung {n} früher anwenden', '提前应用编辑 {n}'],
+  'edits.down': ['Apply edit {n} later', 'Änderung {n} später anwenden', '推后应用编辑 {n}'],
+  'edits.away': ['Take back edit {n}', 'Änderung {n} zurücknehmen', '撤回编辑 {n}'],
+  undo: ['Undo', 'Rückgängig', '撤销'],
+  redo: ['Redo', 'Wiederholen', '重做'],
+  'edit.delete': ['Deleted: {what}', 'Gelöscht: {what}', '已删除：{what}'],
+  'edit.keep': ['Kept alone: {what}', 'Allein behalten: {what}', '仅保留：{what}'],
+  'edit.move': ['Moved: {what}', 'Bewegt: {what}', '已移动：{what}'],
+  'edit.copy': ['Copied: {what}', 'Kopiert: {what}', '已复制：{what}'],
+  'edit.recolor': ['Recoloured: {what}', 'Gefärbt: {what}', '已改色：{what}'],
+  'edit.of.point': ['a clicked thing', 'ein angeklicktes Ding', '点选的物体'],
+  'edit.of.pick': ['a clicked thing', 'ein angeklicktes Ding', '点选的物体'],
+  'edit.of.box': ['a box', 'ein Quader', '一个框'],
+  'edit.of.sphere': ['a ball', 'eine Kugel', '一个球'],
+  'act.on': ['Edit {text}', '{text} ändern', '编辑 {text}'],
+  'act.parts': ['Which part', 'Welcher Teil', '哪一处'],
+  'act.all': ['all of it', 'alles', '全部'],
+  'act.part': ['part {n}', 'Teil {n}', '第 {n} 处'],
+  'act.delete': ['Delete', 'Löschen', '删除'],
+  'act.keep': ['Keep only this', 'Nur dies behalten', '仅保留'],
+  'act.move': ['Move', 'Bewegen', '移动'],
+  'act.recolor': ['Recolour', 'Färben', '改色'],
+  'box.wide': ['Width', 'Breite', '宽'],
+  'box.high': ['Height', 'Höhe', '高'],
+  'box.deep': ['Depth', 'Tiefe', '深'],
+  'move.right': ['To the right', 'Nach rechts', '向右'],
+  'move.up': ['Up', 'Nach oben', '向上'],
+  'move.away': ['Away', 'Nach hinten', '向远'],
+  'move.turn': ['Turn', 'Drehen', '旋转'],
+  'move.times': ['Times as large', 'Mal so groß', '放大倍数'],
+  'move.copy': ['Copy there', 'Dorthin kopieren', '复制到此'],
+  color: ['Colour', 'Farbe', '颜色'],
+  amount: ['Strength', 'Stärke', '强度'],
+  units: ['units', 'Einheiten', '单位'],
+
   // The view.
   'panel.view': ['View', 'Ansicht', '视图'],
   show: ['Show', 'Zeigen', '显示'],
@@ -385,16 +439,17 @@ const TABLE = {
       'One finger turns; two fingers move, and go nearer as they part. Arrow keys turn, with ' +
       'Shift they move; W A S D Q E fly, + and - go nearer and farther, Home is the first ' +
       'photo, N and P are the next and the previous one. A click selects the thing there, ' +
-      'Shift and click one more, Escape lets go. / goes to the question, ? to this help.',
+      'Shift and click one more, Escape lets go. Delete deletes what is selected, Ctrl and Z ' +
+      'takes an edit back. / goes to the question, ? to this help.',
     'Ziehen dreht, mit Umschalt verschiebt es, mit Strg sieht man sich um, das Rad geht ' +
       'näher. Ein Finger dreht; zwei Finger verschieben, und gehen näher, wenn sie ' +
       'auseinandergehen. Pfeiltasten drehen, mit Umschalt verschieben sie; W A S D Q E ' +
       'fliegen, + und - gehen näher und weiter weg, Pos1 ist das erste Foto, N und P sind das ' +
       'nächste und das vorige. Ein Klick wählt das Ding dort, mit Umschalt eines dazu, Esc ' +
-      'lässt los. / geht zur Frage, ? zu dieser Hilfe.',
+      'lässt los. Entf löscht das Gewählte, Strg und Z nimmt eine Änderung zurück. / geht zur Frage, ? zu dieser Hilfe.',
     '拖动旋转，Shift 加拖动平移，Ctrl 加拖动环视，滚轮靠近。单指旋转；双指平移，张开则靠近。' +
       '方向键旋转，加 Shift 平移；W A S D Q E 飞行，+ 和 - 靠近和远离，Home 回到第一张照片，' +
-      'N 和 P 为下一张和上一张。点击选中该处物体，Shift 加点击再选一个，Esc 取消。' +
+      'N 和 P 为下一张和上一张。点击选中该处物体，Shift 加点击再选一个，Esc 取消。Delete 删除所选，Ctrl 加 Z 撤销。' +
       '/ 转到提问，? 打开本帮助。',
   ],
 

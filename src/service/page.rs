@@ -33,6 +33,7 @@ const SCRIPT: &str = concat!(
     include_str!("../../web/state.js"),
     include_str!("../../web/canvas.js"),
     include_str!("../../web/find.js"),
+    include_str!("../../web/edits.js"),
     include_str!("../../web/scenes.js"),
     include_str!("../../web/ways.js"),
     include_str!("../../web/keep.js"),

@@ -11,7 +11,7 @@ from served import ROOT
 VALUES = re.compile(r"\{(\w+)\}")
 USED = re.compile(r"""\bt\(\s*'([^']+)'|data-t(?:-[a-z]+)?="([^"]+)\"""")
 # Keys that are put together, by their beginnings, and those that are a word of the server.
-MADE = ("stage.",)
+MADE = ("stage.", "edit.")
 
 
 @pytest.fixture

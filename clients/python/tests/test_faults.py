@@ -66,7 +66,7 @@ def test_every_code_has_its_class() -> None:
         assert kind.__name__ == "".join(word.title() for word in code.split("_"))
         assert kind.retry == (retry == "yes"), code
         assert kind.__name__ in segsplat.__all__
-    ours = {"connection_lost", "bad_answer"}
+    ours = {"connection_lost", "bad_answer", "server_not_started"}
     assert set(SegSplatError.of_code) == {row[0] for row in rows} | ours
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import httpx
 import numpy as np
 import pytest
 
-from segsplat import InvalidRequest, Scene
+from segsplat import Client, InvalidRequest, Scene
 from segsplat.types import decode_rle
 
 
@@ -150,3 +152,20 @@ def test_run_lengths_of_coco() -> None:
     assert np.array_equal(decode_rle({"size": [3, 4], "counts": "41202"}), mask)
     assert not decode_rle({"size": [2, 3], "counts": "6"}).any()
     assert decode_rle({"size": [2, 3], "counts": "06"}).all()
+
+
+def test_what_a_query_found_is_hidden_and_kept(client: Client, photos: Path) -> None:
+    scene = client.scene(photos, semantics="eager")
+    whole = len(scene.gaussians().means)
+    found = scene.query("box", "a unicorn on the moon", masks=False)
+    assert found[0].found and not found[1].found
+    assert found.hide() == [found[0].gaussians], "an edit for what was found alone"
+    assert scene.edits() == [{"op": "delete", "select": {"text": "box"}}]
+    assert len(scene.gaussians().means) == whole - found[0].gaussians
+    scene.undo()
+    assert scene.query("box", masks=False).keep() == [found[0].gaussians]
+    assert len(scene.gaussians().means) == found[0].gaussians
+    with pytest.raises(ValueError, match="for one text"):
+        found.keep()
+    assert repr(found[0]).startswith("<Match box: ") and "array" not in repr(found[0])
+    scene.delete()

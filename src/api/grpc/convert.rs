@@ -7,8 +7,8 @@ use crate::{
     error::{Error, Result, short},
     scene::{
         CameraToWorld, CameraUse, CamerasMode, CamerasReport, CamerasSource, DropCount,
-        HealthReport, Intrinsics, LeftOutPhoto, MovedCamera, PlacedPhoto, Refine, RefineReport,
-        RefineState, ScoringMethod, SemanticsReport, StageTime, Warning,
+        GrowthState, HealthReport, Intrinsics, LeftOutPhoto, MovedCamera, PlacedPhoto, Refine,
+        RefineReport, RefineState, ScoringMethod, SemanticsReport, StageTime, Warning,
     },
     service::{
         BackgroundSpec, Boxes, CallerLimits, CameraSpec, Density, ERROR_FAST, Event, ExportFormat,
@@ -32,7 +32,8 @@ macro_rules! message {
 pub(super) fn edits(found: SceneEdits) -> Result<pb::SceneEdits> {
     let edits_json = serde_json::to_string(&found.edits)
         .map_err(|e| Error::internal("the edits cannot be written").caused_by(e))?;
-    Ok(pb::SceneEdits { edits_json, counts: found.counts, gaussians: found.gaussians })
+    let SceneEdits { counts, gaussians, uncovered, .. } = found;
+    Ok(pb::SceneEdits { edits_json, counts, gaussians, uncovered })
 }
 
 /// A scene and its semantics.
@@ -55,6 +56,13 @@ pub(super) fn scene(status: SceneStatus) -> pb::Scene {
             state: pb::RefineState::from(status.refinement.state).into(),
             fraction: status.refinement.fraction,
             error: status.refinement.error.map(scene_error),
+        }),
+        growth: Some(pb::GrowthStatus {
+            state: pb::GrowthState::from(status.growth.state).into(),
+            waiting: status.growth.waiting,
+            stage: status.growth.stage.unwrap_or_default(),
+            fraction: status.growth.fraction,
+            error: status.growth.error.map(scene_error),
         }),
     )
 }
@@ -523,6 +531,7 @@ macro_rules! both_ways {
 
 to_number! {
     SceneState = SceneState { Queued, Running, Done, Failed, Cancelled }
+    GrowthState = GrowthState { None, Running, Done, Failed }
     RefineState = RefineState { None, Running, Done, Failed }
     SemanticsState = SemanticsState { Off, None, Running, Ready, Failed }
     CamerasSource = CamerasSource { Given, Solved }

@@ -1,8 +1,8 @@
 """Client of SegSplat Server: photos in, views, depth and text masks out.
 
->>> from segsplat import Client
->>> scene = Client().scene("photos/")
->>> scene.view(from_=0, to=1, t=0.5).save("view.png")
+>>> import segsplat
+>>> with segsplat.local() as client:    # or segsplat.Client(), of a server that runs
+...     client.scene("photos/").view(from_=0, to=1, t=0.5).save("view.png")
 
 Frames and units: the world is that of the uploaded cameras, in their units, or of those that the
 server found, in its own. Cameras are OpenCV: x
@@ -14,11 +14,13 @@ from .client import AsyncClient, AsyncScene, Client, Scene
 from .errors import *  # noqa: F403
 from .errors import __all__ as _errors
 from .gaussians import Gaussians
+from .server import AsyncLocalClient, LocalClient, local, local_async
 from .types import (
     Box,
     Camera,
     Doubt,
     Event,
+    Growth,
     KnownWord,
     Label,
     Match,
@@ -37,6 +39,7 @@ from .view import View
 
 __all__ = [
     "AsyncClient",
+    "AsyncLocalClient",
     "AsyncScene",
     "Box",
     "Camera",
@@ -44,8 +47,10 @@ __all__ = [
     "Doubt",
     "Event",
     "Gaussians",
+    "Growth",
     "KnownWord",
     "Label",
+    "LocalClient",
     "Match",
     "Matches",
     "Models",
@@ -60,5 +65,7 @@ __all__ = [
     "View",
     "Viewpoint",
     "__version__",
+    "local",
+    "local_async",
 ]
 __all__ += _errors

@@ -53,11 +53,11 @@ class _Connection:
         verify: False, or a file of certificates, as in httpx.
         transport: an httpx transport to use instead of the network; not over gRPC.
         """
-        self.policy = Policy(retries, retry_wait_max)
         headers = {"user-agent": f"segsplat-python/{__version__}"}
         if api_key := api_key or os.environ.get("SEGSPLAT_API_KEY"):
             headers["authorization"] = f"Bearer {api_key}"
         base_url = url or os.environ.get("SEGSPLAT_URL", "http://127.0.0.1:8080")
+        self.policy = Policy(retries, retry_wait_max, server=base_url.rstrip("/"))
         self._rpc = _rpc() if base_url.startswith(("grpc://", "grpcs://")) else None
         self._settings: dict[str, Any] = {
             "base_url": base_url,
@@ -66,6 +66,9 @@ class _Connection:
             "transport": transport,
             "verify": verify,
         }
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.policy.server}>"
 
 
 def _rpc() -> Any:
@@ -442,6 +445,8 @@ class Scene(_Scene):
     refresh = _now(calls.refresh)
     delete = _now(calls.delete)
     refine = _now(calls.refine)
+    add = _now(calls.add)
+    remove = _now(calls.remove)
     edits = _now(calls.edits)
     set_edits = _now(calls.set_edits)
     edit = _now(calls.edit)
@@ -471,6 +476,8 @@ class AsyncScene(_Scene):
     refresh = _later(calls.refresh)
     delete = _later(calls.delete)
     refine = _later(calls.refine)
+    add = _later(calls.add)
+    remove = _later(calls.remove)
     edits = _later(calls.edits)
     set_edits = _later(calls.set_edits)
     edit = _later(calls.edit)

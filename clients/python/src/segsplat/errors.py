@@ -35,6 +35,7 @@ __all__ = [
     "Internal",
     "ConnectionLost",
     "BadAnswer",
+    "ServerNotStarted",
     "VersionWarning",
 ]
 
@@ -47,6 +48,8 @@ class SegSplatError(Exception):
     #: Whether the same call may succeed later.
     retry: bool = False
 
+    #: What the caller can do about it; empty where the message says all.
+    remedy: ClassVar[str] = ""
     #: The class of each code.
     of_code: ClassVar[dict[str, type[SegSplatError]]] = {}
 
@@ -69,6 +72,8 @@ class SegSplatError(Exception):
         self.retry_after = retry_after
         #: Id of the scene it is about.
         self.scene = scene
+        #: The call that failed: `GET http://127.0.0.1:8080/v1/scenes/0f3c`.
+        self.call: str | None = None
         if code is not None:
             self.code = code
         if retry is not None:
@@ -78,8 +83,10 @@ class SegSplatError(Exception):
         SegSplatError.of_code[cls.code] = cls
 
     def __str__(self) -> str:
-        told = f" (request {self.request_id})" if self.request_id else ""
-        return f"{self.code}: {self.message}{told}"
+        of = [self.call, self.request_id and f"request {self.request_id}"]
+        told = ", ".join(filter(None, of))
+        said = f"{self.code}: {self.message}{told and f' ({told})'}"
+        return f"{said}: {self.remedy}" if self.remedy else said
 
 
 class InvalidRequest(SegSplatError):
@@ -117,6 +124,7 @@ class SceneNotFound(SegSplatError):
     """No scene of this id."""
 
     code = "scene_not_found"
+    remedy = "client.scenes() lists those that are there"
 
 
 class NotFound(SegSplatError):
@@ -154,24 +162,28 @@ class SemanticsOff(SegSplatError):
     """A text was asked of a scene that was made with `semantics="off"`."""
 
     code = "semantics_off"
+    remedy = 'make the scene anew with semantics="lazy"'
 
 
 class Unauthenticated(SegSplatError):
     """No key was shown, or one that nobody knows."""
 
     code = "unauthenticated"
+    remedy = "give Client(api_key=...), or set SEGSPLAT_API_KEY"
 
 
 class PermissionDenied(SegSplatError):
     """The key may not do this: its scope is too narrow."""
 
     code = "permission_denied"
+    remedy = "use a key of a wider scope"
 
 
 class Overloaded(SegSplatError):
     """Too much work is queued; try again after the time given."""
 
     code = "overloaded"
+    remedy = "ask again later, or wait longer with Client(retry_wait_max=...)"
     retry = True
 
 
@@ -245,6 +257,13 @@ class BadAnswer(SegSplatError):
     """An answer that is not the server's: that of a proxy, or of another program."""
 
     code = "bad_answer"
+    remedy = "look whether the address is that of a SegSplat server"
+
+
+class ServerNotStarted(SegSplatError):
+    """`local()` found no program, or its server did not start."""
+
+    code = "server_not_started"
 
 
 class VersionWarning(UserWarning):

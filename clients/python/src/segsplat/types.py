@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal, TypeAlias, TypeVar, overload
@@ -469,6 +469,21 @@ class Refinement:
 
 
 @dataclass(frozen=True)
+class Growth:
+    """How far photos are that join a scene, or leave it."""
+
+    state: Literal["none", "running", "done", "failed"] = "none"
+    #: Calls whose photos are not in the served version yet.
+    waiting: int = 0
+    #: Stage at work while running.
+    stage: str | None = None
+    #: Share of that work that is done, 0 to 1.
+    fraction: float = 0.0
+    #: Why the last one was given up; the scene is served as it was.
+    error: SceneFault | None = None
+
+
+@dataclass(frozen=True)
 class SceneStatus:
     """A scene at one moment."""
 
@@ -486,9 +501,10 @@ class SceneStatus:
     error: SceneFault | None = None
     report: Report | None = None
     #: Counts what was served under this id: 0 until it is done, then 1, and one more with each
-    #: better version that refinement publishes.
+    #: better version that refinement publishes, and with each change of its photos.
     version: int = 0
     refinement: Refinement = Refinement()
+    growth: Growth = Growth()
 
 
 @dataclass(frozen=True)
@@ -664,6 +680,9 @@ class Match:
     #: Where the relevancy is highest in the view.
     peak: Peak | None
 
+    def __repr__(self) -> str:
+        return f"<Match {self}>"
+
     @property
     def score(self) -> float:
         """The best relevancy of any entry, 0 to 1; from 0.5 on the text is found."""
@@ -720,10 +739,15 @@ class Scoring:
     rivals: float
 
 
+def _no_scene(*_: Any) -> Any:
+    raise ValueError("these matches are of no scene")
+
+
 class Matches(Sequence[Match]):
     """What the texts of a query found, in their order; also by text: `found["chair"]`."""
 
-    def __init__(self, data: Mapping[str, Any]) -> None:
+    def __init__(self, data: Mapping[str, Any], edit: Callable[..., Any] | None = None) -> None:
+        self._edit = edit or _no_scene
         self._all = tuple(Match.of_json(result) for result in data["results"])
         #: Camera of the masks; None where none were asked for.
         self.camera: Camera | None = Camera.of_json(data["camera"]) if "camera" in data else None
@@ -763,6 +787,20 @@ class Matches(Sequence[Match]):
     def __repr__(self) -> str:
         told = (f"{m.text!r}: {m.score:.2f}, {len(m.boxes)} boxes" for m in self._all)
         return f"<Matches {'; '.join(told)}>"
+
+    def hide(self) -> Any:
+        """Takes what the texts found out of the scene's views, answers and files: an edit for each
+        text that was found. `scene.undo()` takes the last one back. Gives how many Gaussians each
+        edit of the scene took; of an `AsyncScene` with `await`.
+        """
+        found = (match.text for match in self._all if match.found)
+        return self._edit(*({"op": "delete", "select": {"text": text}} for text in found))
+
+    def keep(self) -> Any:
+        """Takes all else out of the scene, as `hide`: of a query with one text."""
+        if len(self._all) != 1:
+            raise ValueError(f"keep is for one text; the query has {len(self._all)}")
+        return self._edit({"op": "keep", "select": {"text": self._all[0].text}})
 
     def _repr_png_(self) -> bytes | None:
         masks = self.masks.astype(np.uint8) * 255

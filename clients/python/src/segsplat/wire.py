@@ -120,6 +120,8 @@ class Policy:
     version_unseen: bool = True
     #: What the server takes at once; None where it has not said.
     limits: CallerLimits | None = None
+    #: Address of the server, for errors.
+    server: str = ""
 
 
 def send(policy: Policy, request: Request) -> Flow[Answer]:
@@ -134,6 +136,7 @@ def send(policy: Policy, request: Request) -> Flow[Answer]:
             error = error_of(answer.status, answer.headers, answer.body)
         except SegSplatError as refused:
             error = refused
+        error.call = f"{request.method} {policy.server}{request.path}"
         yield from pause(policy, error, again)
     raise AssertionError("unreachable")
 
