@@ -78,8 +78,8 @@ impl MatcherNetwork {
     }
 
     /// The keypoints of two photos of `sizes` (width and height, pixels) that show the same, in the
-    /// order of the first photo's keypoints. Only the first [`MatcherManifest::count`] keypoints of a
-    /// photo are looked at.
+    /// order of the first photo's keypoints. Only the first [`MatcherManifest::count`] keypoints of
+    /// a photo are looked at.
     ///
     /// # Errors
     /// `internal` when the network fails, or answers with another shape than its manifest says or
