@@ -19,7 +19,8 @@ use crate::{
 
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
-    /// Folder of photos, or a zip or tar of one; cameras in it are not looked at
+    /// Folder of photos, a zip or tar of one, or a video where ffmpeg is installed; cameras in it
+    /// are not looked at
     photos: PathBuf,
     /// File to write, as nerfstudio has it
     #[arg(short, long, value_name = "FILE", default_value = "transforms.json")]

@@ -23,6 +23,7 @@ mod render;
 mod sample;
 mod scene_file;
 mod serve;
+mod video;
 
 use std::{ffi::OsString, path::PathBuf, process::ExitCode};
 

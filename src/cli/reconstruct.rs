@@ -20,6 +20,7 @@ use super::{
         path_to_write, semantics_path, splat_format, splat_titles, splats_of, unreadable,
         unwritable, write_splats,
     },
+    video,
 };
 use crate::{
     config::{Config, ConfigArgs},
@@ -45,7 +46,7 @@ use crate::{
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
     #[arg(help = format!("Folder of a capture (docs/captures.md has the layouts), a zip or tar of \
-        one, or a file of Gaussians ({}), which keeps its semantics", splat_titles()))]
+        one, a video where ffmpeg is installed, or a file of Gaussians ({}), which keeps its semantics", splat_titles()))]
     photos: PathBuf,
     #[arg(short, long, value_name = "FILE")]
     #[arg(help = format!("Scene file to write; with an ending of these that format: {}",
@@ -278,7 +279,7 @@ pub(super) fn read(
     if path.is_dir() {
         return pipeline::read_dir(path, mode, &config.limits, cancel);
     }
-    let upload = archive(path, config)?;
+    let upload = file(path, config)?;
     Ok((pipeline::read(&upload, mode, &config.limits, cancel)?, upload))
 }
 
@@ -286,11 +287,15 @@ pub(super) fn read(
 pub(super) fn upload(path: &Path, mode: CamerasMode, config: &Config) -> Result<Upload> {
     match path.is_dir() {
         true => read(path, mode, config, &AtomicBool::new(false)).map(|(_, upload)| upload),
-        false => archive(path, config),
+        false => file(path, config),
     }
 }
 
-fn archive(path: &Path, config: &Config) -> Result<Upload> {
+/// A video as photos, else an archive.
+fn file(path: &Path, config: &Config) -> Result<Upload> {
+    if video::is_video(path) {
+        return video::photos(path);
+    }
     let size = fs_err::metadata(path).map_err(|e| unreadable(path, e))?.len();
     let max = config.limits.upload_bytes_max;
     if size > max as u64 {

@@ -277,7 +277,51 @@ fn bench_says_the_time_of_a_view_and_its_error() {
     assert_eq!(told["renderer"], "cpu");
 }
 
-/// Makes a bundle of the stand-in `plane` and the feature network of the product.
+#[cfg(unix)]
+#[test]
+fn a_video_becomes_photos_where_ffmpeg_is_there() {
+    use std::os::unix::fs::PermissionsExt;
+    if !with_network() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (film, programs) = (folder.path().join("Film.MP4"), folder.path().join("bin"));
+    std::fs::write(&film, "").unwrap();
+    std::fs::create_dir(&programs).unwrap();
+    let asked = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_segsplat"));
+        command.current_dir(crate::common::root()).env("PATH", &programs);
+        let output = command.args(["cameras", text(&film)]).output().unwrap();
+        (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    let exit = |code: ErrorCode| Some(i32::from(code.row().exit));
+    let (code, said) = asked();
+    assert_eq!(code, exit(ErrorCode::InvalidRequest), "{said}");
+    assert!(said.contains("Film.MP4: it is a video, and there is no ffmpeg; install"), "{said}");
+    // Stands for the program: three seconds that do not move, then the frames that are asked for.
+    let program = programs.join("ffmpeg");
+    let script = r#"#!/bin/sh
+        case "$*" in
+        *rawvideo*) /usr/bin/head -c $((320 * 240 * 30)) /dev/zero;;
+        *"eq(n\,0)+eq(n\,2)+"*)
+            for i in 0 1 2 3 4 5 6 7 8 9 a b c d e f; do printf '\377\330\377\331'; done;;
+        esac
+    "#;
+    std::fs::write(&program, script).unwrap();
+    std::fs::set_permissions(&program, PermissionsExt::from_mode(0o755)).unwrap();
+    let (code, said) = loop {
+        match asked() {
+            // A child that another test starts meanwhile holds the program open.
+            (_, said) if said.contains("does not start") => std::thread::yield_now(),
+            other => break other,
+        }
+    };
+    // They came as photos, named by their times; pictures they are not.
+    assert_eq!(code, exit(ErrorCode::PhotoUnreadable), "{said}");
+    assert!(said.contains("00000.00s.jpg"), "{said}");
+}
+
+/// Makes a bundle of the stand-in `plane` and of what finds and matches keypoints in the product.
 fn with_features(folder: &Path) {
     let root = crate::common::root();
     let at = |bundle: &str| root.join(bundle);
@@ -287,7 +331,8 @@ fn with_features(folder: &Path) {
     let features = &all[all.find("[features]").expect("the product has them")..];
     std::fs::create_dir(folder).unwrap();
     std::fs::write(folder.join("bundle.toml"), manifest(&plane) + "\n" + features).unwrap();
-    for (from, file) in [(&plane, "plane.onnx"), (&product, "features.onnx")] {
+    let product = ["features.onnx", "matcher.onnx"].map(|file| (&product, file));
+    for (from, file) in [(&plane, "plane.onnx")].into_iter().chain(product) {
         std::fs::copy(from.join(file), folder.join(file)).unwrap();
     }
 }
@@ -458,7 +503,7 @@ fn models_say_their_licences_and_views_only_where_they_take_some() {
     assert!(before.contains("plane.onnx"), "{before}");
     for model in ok_json(&["models", "list"])["models"].as_array().unwrap() {
         let licence = model["licence"].as_str().unwrap();
-        if model["name"] == "features" {
+        if model["name"] == "features" || model["name"] == "matcher" {
             // Another project's, as it is.
             assert_eq!(licence, "Apache-2.0");
             continue;

@@ -52,7 +52,7 @@ const TOPS: [&str; 15] = [
 ];
 const LINE_CHARS_MAX: usize = 100;
 const GOLDEN_BYTES_MAX: u64 = 64 << 10;
-const TREE_BYTES_MAX: u64 = 48 << 20;
+const TREE_BYTES_MAX: u64 = 52 << 20;
 
 /// A crate's name and where it may be named.
 const CONFINED: [(&str, &[&str]); 16] = [

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 from served import ROOT, run
 
-from segsplat import Client, calls, formats, photos
+from segsplat import Client, InvalidRequest, calls, formats, photos, video
 from segsplat.wire import Part
 
 FOLDERS = ["", "images/", "depth/", "a/lowres_depth/", "highres_depth/b/", "confidence/",
@@ -106,6 +106,38 @@ def test_photos_alone_are_sent(tmp_path: Path) -> None:
     assert [part.name for part in calls.parts_of(tmp_path)] == sent
     with pytest.raises(FileNotFoundError, match="there is no such file or folder"):
         calls.parts_of(tmp_path / "none")
+
+
+def test_a_video_is_sent_as_sharp_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    film = tmp_path / "Film.MP4"
+    film.touch()
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+    with pytest.raises(InvalidRequest, match=r"Film\.MP4: it is a video, .* install"):
+        calls.parts_of(film)
+    # Stands for the program: three seconds that do not move, then the frames that are asked for.
+    program = tmp_path / "bin/ffmpeg"
+    program.parent.mkdir()
+    size = video.WIDTH * video.HEIGHT * 30
+    program.write_text(f"""#!/bin/sh
+case "$*" in
+*rawvideo*) /usr/bin/head -c {size} /dev/zero;;
+*"eq(n\\,0)+eq(n\\,2)+"*)
+    for i in 0 1 2 3 4 5 6 7 8 9 a b c d e f; do printf '\\377\\330\\377\\331'; done;;
+esac
+""")
+    program.chmod(0o755)
+    sent = calls.parts_of(film)
+    assert [part.name for part in sent][:3] == ["00000.00s.jpg", "00000.20s.jpg", "00000.40s.jpg"]
+    assert len(sent) == 16 and {part.content for part in sent} == {b"\xff\xd8\xff\xd9"}
+
+
+def test_sharp_frames_are_chosen_over_the_motion() -> None:
+    still = [(1.0, 0.0)] * 100
+    moving = [(3.0 - i % 2, 2.0) for i in range(20)]
+    places = video.chosen(still + moving, 9)
+    assert len(places) == 9 and all(place >= 100 for place in places[1:])
+    assert all((still + moving)[place][0] == 3.0 for place in places[1:])
+    assert video.chosen(still[:5], 16) == [0, 1, 2, 3, 4]
 
 
 def test_the_limits_are_those_that_the_server_says(client: Client) -> None:

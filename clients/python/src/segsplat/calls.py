@@ -50,6 +50,7 @@ from .types import (
     ViewsCall,
     parse,
 )
+from .video import VIDEOS, frames_of
 from .view import FORMATS, View, picture
 from .wire import (
     Flow,
@@ -154,6 +155,8 @@ def parts_of(
     path = Path(source)
     if path.suffix.lower() in SPLATS and not path.is_dir():
         return [Part("splats", path.name, path)]
+    if path.suffix.lower() in VIDEOS and path.is_file():
+        return frames_of(path)
     if path.is_file():
         return [Part("archive", path.name, path)]
     if not path.exists():

@@ -226,7 +226,8 @@ class Client(_Connection):
 
         source: a folder with photos, whose cameras the server finds; or with a capture:
             `transforms.json`, COLMAP, Polycam and others, which the server recognises; a zip or
-            tar of one; `{"photo.jpg": Camera(...)}`; or a file of Gaussians
+            tar of one; `{"photo.jpg": Camera(...)}`; a video, where the program `ffmpeg` is
+            installed: 16 to 64 sharp frames of it are sent; or a file of Gaussians
             (PLY, SPZ, SOG, GLB, .splat), which needs no photos.
         masks: a folder with masks, each named as its photo (`0001.png` or `0001.jpg.png`): what is
             black in them takes no part in the scene. Those that a `transforms.json` names, and

@@ -19,7 +19,7 @@ use crate::{
         NetworkOptions, SETUP_COMMAND,
         manifest::{
             Faults, FeaturesManifest, GeometryManifest, ImageTextManifest, MANIFEST, MasksManifest,
-            TextMasksManifest, is_plain, unavailable,
+            MatcherManifest, TextMasksManifest, is_plain, unavailable,
         },
         onnx::OnnxHeader,
         places,
@@ -58,6 +58,7 @@ struct BundleManifest {
     image_text: Option<ImageTextManifest>,
     text_masks: Option<TextMasksManifest>,
     features: Option<FeaturesManifest>,
+    matcher: Option<MatcherManifest>,
 }
 
 /// The keys of weights beside a network, `data` and `data_sha256`.
@@ -69,7 +70,8 @@ pub struct BundleFile<'a> {
     /// What it is for: `geometry`, `geometry.cpu`, `geometry.many`, `geometry.many.cpu`,
     /// `masks.encoder`, `masks.decoder`, `image_text.image`, `image_text.text`,
     /// `image_text.tokenizer`, `image_text.words`, `text_masks.image`, `text_masks.find`,
-    /// `text_masks.tokenizer`, `features`. A file of weights beside another has that one's name.
+    /// `text_masks.tokenizer`, `features`, `matcher`. A file of weights beside another has that
+    /// one's name.
     pub part: &'static str,
     /// Name in the bundle's folder.
     pub file: &'a str,
@@ -156,6 +158,9 @@ impl Bundle {
         }
         if let Some(features) = &manifest.features {
             features.validate(&mut faults);
+        }
+        if let Some(matcher) = &manifest.matcher {
+            matcher.validate(manifest.features.is_some(), &mut faults);
         }
         let sha256 = hex(&Sha256::digest(&text));
         let bundle = Self { dir: dir.to_owned(), sha256, manifest, words: Arc::default() };
@@ -264,6 +269,13 @@ impl Bundle {
         self.manifest.features.as_ref()
     }
 
+    /// The entry of the network that matches keypoints; `None`: they match by their descriptors
+    /// alone.
+    #[must_use]
+    pub fn matcher(&self) -> Option<&MatcherManifest> {
+        self.manifest.matcher.as_ref()
+    }
+
     /// What it lacks for semantics; `None` where nothing.
     #[must_use]
     pub fn lacks_semantics(&self) -> Option<&'static str> {
@@ -278,7 +290,7 @@ impl Bundle {
     /// Every file that the manifest names, itself left out.
     #[must_use]
     pub fn files<'a>(&'a self) -> Vec<BundleFile<'a>> {
-        let BundleManifest { geometry, masks, image_text, text_masks, features, .. } =
+        let BundleManifest { geometry, masks, image_text, text_masks, features, matcher, .. } =
             &self.manifest;
         let mut files = Vec::new();
         let mut network = |part, licence, [file, sha256]: [&'a str; 2], data: Data<'a>| {
@@ -321,6 +333,9 @@ impl Bundle {
         }
         if let Some(f) = features {
             network("features", &f.licence, [&f.file, &f.sha256], [&f.data, &f.data_sha256]);
+        }
+        if let Some(m) = matcher {
+            network("matcher", &m.licence, [&m.file, &m.sha256], [&m.data, &m.data_sha256]);
         }
         files
     }

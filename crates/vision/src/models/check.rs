@@ -6,8 +6,8 @@ use std::{path::Path, time::Instant};
 use crate::{
     error::Result,
     models::{
-        Bundle, FeatureNetwork, Geometry, ImageText, MaskNetwork, NetworkOptions, ProviderChoice,
-        Runtime, TextMaskNetwork, features, geometry, image_text, masks,
+        Bundle, FeatureNetwork, Geometry, ImageText, MaskNetwork, MatcherNetwork, NetworkOptions,
+        ProviderChoice, Runtime, TextMaskNetwork, features, geometry, image_text, masks, matcher,
         network::{self, Signature},
         text_masks,
     },
@@ -120,6 +120,14 @@ pub fn check(dir: &Path, options: &NetworkOptions) -> Result<BundleCheck> {
                     |of| of.as_ref().map_or(Ok(()), FeatureNetwork::try_out),
                 )
             });
+            if let Some(own) = bundle.matcher() {
+                run("matcher", &matcher::signatures(own, manifest), &|| {
+                    timed(
+                        || MatcherNetwork::open(runtime, &bundle, options),
+                        |of| of.as_ref().map_or(Ok(()), MatcherNetwork::try_out),
+                    )
+                });
+            }
         }
     }
     let name = format!("{} {}", bundle.name(), bundle.version());

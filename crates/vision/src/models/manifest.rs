@@ -718,6 +718,51 @@ impl FeaturesManifest {
     }
 }
 
+/// The network that matches keypoints in `bundle.toml`.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MatcherManifest {
+    /// File in the bundle's folder.
+    pub file: String,
+    /// Its sha256, hex.
+    pub sha256: String,
+    /// File of the weights that are not in `file`.
+    pub data: Option<String>,
+    /// Its sha256, hex.
+    pub data_sha256: Option<String>,
+    /// Licence of the weights.
+    pub licence: String,
+    /// Where the weights come from.
+    pub source: String,
+    /// Inputs of the first and of the second photo: `[N, 2]` f32, x and y from the middle of the
+    /// photo, halves of its longer side.
+    pub keypoints: [String; 2],
+    /// Inputs: `[N, dim]` f32, the descriptors of `[features]`.
+    pub descriptors: [String; 2],
+    /// Output: `[N]` f32 for each keypoint of the first photo, the place of its match among those
+    /// of the second; -1: none.
+    pub matches: String,
+    /// Output: `[N]` f32, how sure each match is, 0..1.
+    pub scores: String,
+    /// Most keypoints of a photo, the best of those that there are.
+    pub count: usize,
+    /// A match counts where its score is over this.
+    pub score_min: f32,
+}
+
+impl MatcherManifest {
+    /// `features`: whether the bundle has the network whose keypoints are matched.
+    pub(super) fn validate(&self, features: bool, faults: &mut Faults) {
+        faults.file("matcher", &self.file, &self.sha256);
+        faults.data("matcher", &self.data, &self.data_sha256);
+        faults.range("matcher.count", self.count, 1..=KEYPOINTS_MAX);
+        faults.range("matcher.score_min", self.score_min, 0.0..=1.0);
+        if !features {
+            faults.wrong("matcher.file", &self.file, "have the section [features] beside it");
+        }
+    }
+}
+
 /// Width and height of a photo whose longer side becomes `side`, both whole multiples of `cell`.
 fn in_cells(photo: [u32; 2], side: u32, cell: u32) -> [u32; 2] {
     let longer = f64::from(photo[0].max(photo[1]).max(1));

@@ -3,7 +3,7 @@
 //! [`Geometry`]: photos with cameras, depth ranges and neighbours to [`ViewGaussians`].
 //! [`MaskNetwork`]: a photo and points in it to masks. [`ImageText`]: crops and texts to embeddings
 //! of one space. [`TextMaskNetwork`]: a photo and a text to masks. [`FeatureNetwork`]: a photo to
-//! keypoints and descriptors. A network is known only by its `bundle.toml`: names, sizes,
+//! keypoints and descriptors. [`MatcherNetwork`]: those of two photos to matches. A network is known only by its `bundle.toml`: names, sizes,
 //! normalisation and frames all come from there. The only module that knows `ort`.
 //!
 //! [`ViewGaussians`]: crate::scene::ViewGaussians
@@ -18,6 +18,7 @@ mod geometry;
 mod image_text;
 mod manifest;
 mod masks;
+mod matcher;
 mod network;
 mod onnx;
 mod options;
@@ -37,10 +38,11 @@ pub use image_text::{ImageText, PreparedCrops};
 pub use manifest::{
     DenseManifest, FeaturesManifest, GeometryManifest, GeometryWeights, ImageTextManifest,
     ImageTowerManifest, MaskAdapter, MaskDecoderManifest, MaskEncoderManifest, MasksManifest,
-    OutputFrame, PlainFile, TextMasksFindManifest, TextMasksImageManifest, TextMasksManifest,
-    TextTowerManifest, Translation,
+    MatcherManifest, OutputFrame, PlainFile, TextMasksFindManifest, TextMasksImageManifest,
+    TextMasksManifest, TextTowerManifest, Translation,
 };
 pub use masks::{MaskNetwork, PhotoEmbedding};
+pub use matcher::{MatcherNetwork, SureMatch};
 pub use network::Network;
 pub use options::{NetworkOptions, ProviderChoice, SETUP_COMMAND};
 pub use resize::ResizeFilter;

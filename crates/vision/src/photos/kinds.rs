@@ -35,12 +35,17 @@ pub(super) fn name(format: ImageFormat) -> &'static str {
 /// The format of a file, or a sentence on what it is and what to do.
 pub(super) fn of(bytes: &[u8]) -> Result<ImageFormat, String> {
     if let Some(what) = other(bytes) {
-        let phone = if what.contains("HEIC") {
-            " (iPhone: Settings > Camera > Formats > Most Compatible)"
-        } else {
-            ""
-        };
-        return Err(format!("{what}, which is not read; save it as JPEG{phone}"));
+        return Err(match what {
+            "a HEIC file" => format!(
+                "{what}, which is not read; save it as JPEG (iPhone: Settings > Camera > Formats > \
+                 Most Compatible)"
+            ),
+            "a video" => format!(
+                "{what}, which is not read; save frames of it as JPEG: `segsplat reconstruct` and \
+                 the Python client do that where ffmpeg is installed"
+            ),
+            _ => format!("{what}, which is not read; save it as JPEG"),
+        });
     }
     let guessed = image::guess_format(bytes).ok();
     guessed.filter(|format| READ.iter().any(|(known, _)| known == format)).ok_or_else(|| {
@@ -109,7 +114,7 @@ mod tests {
         for (bytes, words) in [
             (&heic[..], ["HEIC", "Most Compatible"]),
             (avif, ["AVIF", "save it as JPEG"]),
-            (b"\0\0\0\x14ftypqt  \0\0\0\0qt  ", ["video", "JPEG"]),
+            (b"\0\0\0\x14ftypqt  \0\0\0\0qt  ", ["video", "ffmpeg"]),
             (b"GIF89a", ["GIF", "JPEG"]),
             (b"II*\0\x10\0\0\0CR\x02\0", ["raw", "JPEG"]),
             (b"just text", ["not a photo", "TIFF"]),

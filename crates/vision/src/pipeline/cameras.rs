@@ -3,7 +3,14 @@
 //! The solver sees keypoints alone. The judge is the plane sweep of `capture`, which compares the
 //! photos' pixels under the cameras: what it calls wrong of given cameras refuses solved ones.
 
-use std::{sync::Arc, time::Instant};
+use std::{
+    collections::HashSet,
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+    },
+    time::Instant,
+};
 
 use rayon::prelude::*;
 use segsplat_cameras::{
@@ -21,9 +28,9 @@ use crate::{
     capture,
     error::{Error, ErrorCode, Result, short},
     formats::captures::FIND_CAMERAS,
-    matching::Descriptors,
+    matching::{Descriptors, KeypointPair},
     meter,
-    models::FeatureNetwork,
+    models::{FeatureNetwork, MatcherNetwork, PhotoFeatures, SureMatch},
     photos,
     scene::{
         Camera, CameraToWorld, CamerasReport, CamerasSource, LeftOutPhoto, Photo, PlacedPhoto,
@@ -33,13 +40,16 @@ use crate::{
 };
 
 /// Where keypoints and matches end in the stage.
-const KEYPOINTS_END: f32 = 0.5;
-const MATCHES_END: f32 = 0.65;
+const KEYPOINTS_END: f32 = 0.15;
+const MATCHES_END: f32 = 0.7;
 const SOLVED_END: f32 = 0.95;
 /// Fewest photos that make a scene.
 const PLACED_MIN: usize = 2;
 /// Photos that one message names.
 const NAMED_MAX: usize = 4;
+/// How far a match of most similar descriptors is trusted beside those of the network, which are
+/// tried first.
+const NEAREST_TRUST: f32 = 0.5;
 /// What can be done about photos whose cameras are not found.
 const REMEDY: &str = "Take more photos, each of which shows most of what the one before shows, of \
     things with texture; or send cameras with them";
@@ -75,6 +85,19 @@ impl Pipeline {
     pub fn features(&self) -> Result<Arc<FeatureNetwork>> {
         let open = || FeatureNetwork::open(&self.runtime, &self.bundle, &self.lazy.options);
         opened(&self.lazy.features, "feature network, which finds the cameras of photos", open)
+    }
+
+    /// The network that matches keypoints, opened at the first call; `None` where the bundle has
+    /// none.
+    ///
+    /// # Errors
+    /// `model_unavailable` when it does not open.
+    pub fn matcher(&self) -> Result<Option<Arc<MatcherNetwork>>> {
+        if self.bundle.matcher().is_none() {
+            return Ok(None);
+        }
+        let open = || MatcherNetwork::open(&self.runtime, &self.bundle, &self.lazy.options);
+        opened(&self.lazy.matcher, "network that matches keypoints", open).map(Some)
     }
 }
 
@@ -183,36 +206,54 @@ fn matched(
 ) -> Result<(Vec<PhotoKeypoints>, Vec<PairMatches>)> {
     let Watch { progress, cancel } = watch;
     let tell = |fraction: f32| progress(Stage::Cameras, fraction);
-    let network = pipeline.features()?;
-    let (mut keypoints, mut descriptors) = (Vec::new(), Vec::new());
-    for (done, (photo, focal)) in photos.iter().enumerate() {
+    let (network, matcher) = (pipeline.features()?, pipeline.matcher()?);
+    let (mut seen, mut descriptors) = (Vec::new(), Vec::new());
+    for (done, (photo, _)) in photos.iter().enumerate() {
         unless_cancelled(cancel)?;
         tell(KEYPOINTS_END * fraction(done, photos.len()));
         let found = pipeline.workers.install(|| network.find(photo))?;
         descriptors.push(Descriptors::new(&found.descriptors, found.dim));
-        keypoints.push(PhotoKeypoints {
-            size: [photo.width, photo.height],
-            focal: *focal,
-            keypoints: found.keypoints,
-            seconds: None,
-        });
+        seen.push(found);
     }
     tell(KEYPOINTS_END);
     let alike = |i: usize, j: usize| descriptors[i].alike(&descriptors[j]);
     let pairs = pairs_to_match(photos.len(), alike);
     let least = network.manifest().similarity_min;
+    let size = |i: usize| [photos[i].0.width, photos[i].0.height];
+    let done = AtomicUsize::new(0);
     let matched = |&[i, j]: &[usize; 2]| {
         unless_cancelled(cancel)?;
-        let found = descriptors[i].matched(&descriptors[j], least);
-        let pairs = found.iter().map(|pair| pair.keypoints).collect();
-        let scores = found.iter().map(|pair| pair.similarity.clamp(0.0, 1.0)).collect();
-        Ok::<_, Error>(PairMatches { photos: [i, j], pairs, scores })
+        let nearest = descriptors[i].matched(&descriptors[j], least);
+        let sure = match &matcher {
+            Some(matcher) => matcher.matched([&seen[i], &seen[j]], [i, j].map(size))?,
+            None => Vec::new(),
+        };
+        let share = fraction(done.fetch_add(1, Ordering::Relaxed), pairs.len());
+        tell(KEYPOINTS_END + (MATCHES_END - KEYPOINTS_END) * share);
+        Ok::<_, Error>(joined([i, j], &sure, &nearest))
     };
     let matches = pipeline
         .workers
         .install(|| pairs.par_iter().map(matched).collect::<Result<Vec<PairMatches>>>())?;
     tell(MATCHES_END);
-    Ok((keypoints, matches))
+    let of_photo = |(found, (photo, focal)): (PhotoFeatures, &(&Photo, Option<f64>))| {
+        let (size, keypoints) = ([photo.width, photo.height], found.keypoints);
+        PhotoKeypoints { size, focal: *focal, keypoints, seconds: None }
+    };
+    Ok((seen.into_iter().zip(photos).map(of_photo).collect(), matches))
+}
+
+/// Matches of a pair of photos: those of the network, then those of the most similar descriptors
+/// whose keypoints it did not match. The share of all that agree with one geometry tells right
+/// pairs of photos from wrong ones, which the network's alone does not.
+fn joined(photos: [usize; 2], sure: &[SureMatch], nearest: &[KeypointPair]) -> PairMatches {
+    let taken = [0, 1].map(|side| -> HashSet<u32> { sure.iter().map(|of| of.0[side]).collect() });
+    let is_new = |of: &&KeypointPair| [0, 1].iter().all(|&s| !taken[s].contains(&of.keypoints[s]));
+    let trust = if sure.is_empty() { 1.0 } else { NEAREST_TRUST };
+    let others = nearest.iter().filter(is_new);
+    let others = others.map(|of| (of.keypoints, trust * of.similarity.clamp(0.0, 1.0)));
+    let (pairs, scores) = sure.iter().copied().chain(others).unzip();
+    PairMatches { photos, pairs, scores }
 }
 
 /// Photos whose cameras stand the judgement.

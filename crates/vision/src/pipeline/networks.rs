@@ -6,7 +6,9 @@ use parking_lot::Mutex;
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    models::{FeatureNetwork, ImageText, MaskNetwork, NetworkOptions, TextMaskNetwork},
+    models::{
+        FeatureNetwork, ImageText, MaskNetwork, MatcherNetwork, NetworkOptions, TextMaskNetwork,
+    },
 };
 
 /// The networks that not every scene needs, opened at the first use and kept.
@@ -17,13 +19,14 @@ pub(super) struct LazyNetworks {
     pub(super) image_text: Mutex<Option<Arc<ImageText>>>,
     pub(super) text_masks: Mutex<Option<Arc<TextMaskNetwork>>>,
     pub(super) features: Mutex<Option<Arc<FeatureNetwork>>>,
+    pub(super) matcher: Mutex<Option<Arc<MatcherNetwork>>>,
 }
 
 impl LazyNetworks {
     pub(super) fn new(options: &NetworkOptions) -> Self {
         let options = options.clone();
-        let (masks, image_text, text_masks, features) = Default::default();
-        Self { options, masks, image_text, text_masks, features }
+        let (masks, image_text, text_masks, features, matcher) = Default::default();
+        Self { options, masks, image_text, text_masks, features, matcher }
     }
 
     /// Why an open network is not computed where it was to be; one that is being opened says
