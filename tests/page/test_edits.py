@@ -52,7 +52,7 @@ def edited(page: Page, says: str) -> None:
 
 
 def rows(page: Page) -> list[str]:
-    return [re.sub(r"\s*\(.*|\d[\d,]* Gaussians.*", "", one)
+    return [re.sub(r"\s*\(.*|\d[\d,]* Gaussians.*", "", one).strip()
             for one in page.locator("#edits li > span").all_inner_texts()]
 
 

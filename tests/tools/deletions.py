@@ -54,13 +54,19 @@ def made(client: segsplat.Client, folder: Path) -> tuple[segsplat.Scene, list[st
     return scene, [Path(frame["file_path"]).name for frame in frames]
 
 
+def seen(scene: segsplat.Scene, truth: np.ndarray) -> np.ndarray:
+    """The views of all photos, in the size of their masks."""
+    count, height, width = truth.shape
+    views = [scene.view(from_=i, width=width, height=height).image for i in range(count)]
+    return np.stack(views)
+
+
 def main(folders: list[Path]) -> None:
     with segsplat.local(flags=["--renderer", "cpu"], env={"SEGSPLAT_REFINE": "off"}) as client:
         for folder in folders:
             scene, names = made(client, folder)
             truth = np.stack([np.asarray(Image.open(folder / "masks" / name)) for name in names])
-            views = range(len(names))
-            before = np.stack([scene.view(from_=i).image for i in views])
+            before = seen(scene, truth)
             classes = json.loads((folder / "masks/classes.json").read_text())
             for value, word in classes.items():
                 thing = truth == int(value)
@@ -72,7 +78,7 @@ def main(folders: list[Path]) -> None:
                     continue
                 iou = (found[0].mask & thing[0]).sum() / (found[0].mask | thing[0]).sum()
                 found.hide()
-                after = np.stack([scene.view(from_=i).image for i in views])
+                after = seen(scene, truth)
                 scene.set_edits([])
                 same = np.abs(after.astype(int) - before).max(-1) < CHANGED
                 near = np.stack([grown(one, MARGIN) for one in thing])
