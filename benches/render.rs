@@ -112,7 +112,7 @@ impl Stages {
 
     fn shade(&mut self) {
         let options = KernelOptions::default();
-        shade::shade(&self.gaussians, &self.view, options, &mut self.projected);
+        shade::shade(&self.gaussians, &self.view, options, false, &mut self.projected);
     }
 
     fn bin(&mut self) {

@@ -200,14 +200,9 @@ function show(word) {
   showWords();
 }
 
-// The first text has the semantics made, and their stages come as events. The events of a finished
-// scene end at once, which it is until the question has come: they are asked for again until it is
-// answered.
-async function watchUnderstanding(id, signal) {
-  while (!signal.aborted) {
-    await server.watch(id, progress, signal).catch(() => {});
-    await new Promise((go) => setTimeout(go, 200));
-  }
+// The first text has the semantics made, and their stages come as events.
+function watchUnderstanding(id, signal) {
+  server.watch(id, progress, signal, { semantics: true }).catch(() => {});
 }
 
 // What was measured of the word of an answer: { trust, word, words } with how many words were. Null

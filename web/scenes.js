@@ -305,7 +305,7 @@ async function followVersions(id, shown, signal) {
     newest = version;
     takeNewest().catch(failed);
   };
-  await server.watch(id, heard, signal, true);
+  await server.watch(id, heard, signal, { versions: true });
   if (!signal.aborted) about(await server.json(`/v1/scenes/${id}`));
 }
 

@@ -74,7 +74,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             "scene": name, "photos": photos.len(), "neighbours": args.neighbours,
             "placed": placed, "rotation_deg": number(rotation_deg), "focal": number(focal),
             "confidence": found.confidence, "seconds": seconds, "outcome": outcome,
-            "refused": found.refused, "evidence": format!("{:?}", found.evidence),
+            "refused": found.refused, "evidence": found.evidence,
         });
         rows.push(json!({ "rotation_deg": number(rotation_deg) }), row)?;
     }

@@ -5,7 +5,7 @@ use std::{
     sync::Arc,
 };
 
-use segsplat_core::names::named;
+use segsplat_core::{limits::Limits, names::named};
 
 use crate::{
     error::{Error, Result},
@@ -49,6 +49,9 @@ pub(crate) struct Setup {
     /// Part of the name of the GPU adapter
     #[arg(long)]
     adapter: Option<String>,
+    /// Bytes of scenes that the GPU may hold
+    #[arg(long, default_value_t = Limits::default().device_scene_bytes_max)]
+    scene_bytes: u64,
 }
 
 impl Inputs {
@@ -119,8 +122,8 @@ impl Setup {
             renderer: self.renderer,
             adapter: self.adapter.clone(),
             threads: self.threads(),
+            scene_bytes_max: self.scene_bytes,
             switches,
-            ..RendererOptions::default()
         })
     }
 }

@@ -828,6 +828,28 @@ pub struct Scene {
     /// How far its refinement is.
     #[prost(message, optional, tag = "12")]
     pub refinement: ::core::option::Option<RefineStatus>,
+    /// How far photos are that joined it or left it after it was made.
+    #[prost(message, optional, tag = "13")]
+    pub growth: ::core::option::Option<GrowthStatus>,
+}
+/// How far the changes of the photos of a scene are.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct GrowthStatus {
+    /// Where they stand.
+    #[prost(enumeration = "GrowthState", tag = "1")]
+    pub state: i32,
+    /// Calls whose photos are not in the served version yet.
+    #[prost(uint32, tag = "2")]
+    pub waiting: u32,
+    /// Stage at work while running.
+    #[prost(string, tag = "3")]
+    pub stage: ::prost::alloc::string::String,
+    /// Share of that work that is done, 0..1.
+    #[prost(float, tag = "4")]
+    pub fraction: f32,
+    /// Why the last one was given up.
+    #[prost(message, optional, tag = "5")]
+    pub error: ::core::option::Option<SceneError>,
 }
 /// How far the refinement of a scene is.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -1097,6 +1119,10 @@ pub struct WatchSceneRequest {
     /// Id.
     #[prost(string, tag = "1")]
     pub scene_id: ::prost::alloc::string::String,
+    /// Go on after the scene is made until its semantics are: who asks a first text at the same time
+    /// sees all of its stages.
+    #[prost(bool, tag = "2")]
+    pub semantics: bool,
 }
 /// What happens to a scene. DONE, FAILED and CANCELLED are last events. Semantics that are being
 /// made while the scene can be viewed already show as RUNNING with their stage.
@@ -1168,6 +1194,70 @@ pub struct RefineSceneRequest {
     /// auto (also where it is empty), off, or so many milliseconds.
     #[prost(string, tag = "2")]
     pub refine: ::prost::alloc::string::String,
+}
+/// A piece of photos that join a scene: a header first, then the photos one after the other or one
+/// archive.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct AddPhotosRequest {
+    #[prost(oneof = "add_photos_request::Part", tags = "1, 2, 3")]
+    pub part: ::core::option::Option<add_photos_request::Part>,
+}
+/// Nested message and enum types in `AddPhotosRequest`.
+pub mod add_photos_request {
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Oneof)]
+    pub enum Part {
+        /// First message, once.
+        #[prost(message, tag = "1")]
+        Header(super::AddPhotosHeader),
+        /// A piece of a photo, or of a camera file of a capture.
+        #[prost(message, tag = "2")]
+        Photo(super::PhotoChunk),
+        /// A piece of the archive: a zip or tar of a folder with a capture of any known layout.
+        #[prost(bytes, tag = "3")]
+        Archive(::prost::bytes::Bytes),
+    }
+}
+/// Which scene they join, and their cameras.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct AddPhotosHeader {
+    /// Id.
+    #[prost(string, tag = "1")]
+    pub scene_id: ::prost::alloc::string::String,
+    /// How long to wait for the version with them before answering, milliseconds.
+    #[prost(uint64, optional, tag = "4")]
+    pub wait_ms: ::core::option::Option<u64>,
+    /// Two calls with one key and the same photos add them once.
+    #[prost(string, tag = "5")]
+    pub idempotency_key: ::prost::alloc::string::String,
+    /// Camera description; left out when it is among the files or in the archive.
+    #[prost(oneof = "add_photos_header::Cameras", tags = "2, 3")]
+    pub cameras: ::core::option::Option<add_photos_header::Cameras>,
+}
+/// Nested message and enum types in `AddPhotosHeader`.
+pub mod add_photos_header {
+    /// Camera description; left out when it is among the files or in the archive.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Oneof)]
+    pub enum Cameras {
+        /// A nerfstudio or instant-ngp transforms.json (OpenGL axes).
+        #[prost(bytes, tag = "2")]
+        TransformsJson(::prost::bytes::Bytes),
+        /// Our own JSON (OpenCV axes): {"cameras":\[{"file","intrinsics","camera_to_world"}\]}.
+        #[prost(bytes, tag = "3")]
+        CamerasJson(::prost::bytes::Bytes),
+    }
+}
+/// Which photo leaves a scene.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct RemovePhotoRequest {
+    /// Id.
+    #[prost(string, tag = "1")]
+    pub scene_id: ::prost::alloc::string::String,
+    /// File name of the photo, as the cameras of the scene have it.
+    #[prost(string, tag = "2")]
+    pub name: ::prost::alloc::string::String,
+    /// How long to wait for the version without it before answering, milliseconds.
+    #[prost(uint64, optional, tag = "3")]
+    pub wait_ms: ::core::option::Option<u64>,
 }
 /// Whose edits.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1693,6 +1783,47 @@ impl SceneState {
             "SCENE_STATE_DONE" => Some(Self::Done),
             "SCENE_STATE_FAILED" => Some(Self::Failed),
             "SCENE_STATE_CANCELLED" => Some(Self::Cancelled),
+            _ => None,
+        }
+    }
+}
+/// Where the changes of the photos of a scene stand.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum GrowthState {
+    /// Not used.
+    Unspecified = 0,
+    /// The scene has the photos that it was made of.
+    None = 1,
+    /// Photos wait to join or leave, or do so now; the version before is served meanwhile.
+    Running = 2,
+    /// The version that is served has all changes.
+    Done = 3,
+    /// The last change was given up; `error` says why. The version that is served stays.
+    Failed = 4,
+}
+impl GrowthState {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "GROWTH_STATE_UNSPECIFIED",
+            Self::None => "GROWTH_STATE_NONE",
+            Self::Running => "GROWTH_STATE_RUNNING",
+            Self::Done => "GROWTH_STATE_DONE",
+            Self::Failed => "GROWTH_STATE_FAILED",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "GROWTH_STATE_UNSPECIFIED" => Some(Self::Unspecified),
+            "GROWTH_STATE_NONE" => Some(Self::None),
+            "GROWTH_STATE_RUNNING" => Some(Self::Running),
+            "GROWTH_STATE_DONE" => Some(Self::Done),
+            "GROWTH_STATE_FAILED" => Some(Self::Failed),
             _ => None,
         }
     }
@@ -2260,6 +2391,51 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("segsplat.v1.SceneService", "RefineScene"));
             self.inner.unary(req, path, codec).await
         }
+        /// Adds posed photos, in the frame of the scene's own cameras, to a finished scene. First a header,
+        /// then the photos or one archive in pieces. The version before is served until they have joined.
+        pub async fn add_photos(
+            &mut self,
+            request: impl tonic::IntoStreamingRequest<Message = super::AddPhotosRequest>,
+        ) -> std::result::Result<tonic::Response<super::Scene>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/segsplat.v1.SceneService/AddPhotos",
+            );
+            let mut req = request.into_streaming_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("segsplat.v1.SceneService", "AddPhotos"));
+            self.inner.client_streaming(req, path, codec).await
+        }
+        /// Takes a photo out of a finished scene.
+        pub async fn remove_photo(
+            &mut self,
+            request: impl tonic::IntoRequest<super::RemovePhotoRequest>,
+        ) -> std::result::Result<tonic::Response<super::Scene>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/segsplat.v1.SceneService/RemovePhoto",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("segsplat.v1.SceneService", "RemovePhoto"));
+            self.inner.unary(req, path, codec).await
+        }
         /// The edits of a scene, and how many Gaussians each took.
         pub async fn get_edits(
             &mut self,
@@ -2525,6 +2701,17 @@ pub mod scene_service_server {
         async fn refine_scene(
             &self,
             request: tonic::Request<super::RefineSceneRequest>,
+        ) -> std::result::Result<tonic::Response<super::Scene>, tonic::Status>;
+        /// Adds posed photos, in the frame of the scene's own cameras, to a finished scene. First a header,
+        /// then the photos or one archive in pieces. The version before is served until they have joined.
+        async fn add_photos(
+            &self,
+            request: tonic::Request<tonic::Streaming<super::AddPhotosRequest>>,
+        ) -> std::result::Result<tonic::Response<super::Scene>, tonic::Status>;
+        /// Takes a photo out of a finished scene.
+        async fn remove_photo(
+            &self,
+            request: tonic::Request<super::RemovePhotoRequest>,
         ) -> std::result::Result<tonic::Response<super::Scene>, tonic::Status>;
         /// The edits of a scene, and how many Gaussians each took.
         async fn get_edits(
@@ -2928,6 +3115,98 @@ pub mod scene_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = RefineSceneSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/segsplat.v1.SceneService/AddPhotos" => {
+                    #[allow(non_camel_case_types)]
+                    struct AddPhotosSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::ClientStreamingService<super::AddPhotosRequest>
+                    for AddPhotosSvc<T> {
+                        type Response = super::Scene;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<
+                                tonic::Streaming<super::AddPhotosRequest>,
+                            >,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::add_photos(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = AddPhotosSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.client_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/segsplat.v1.SceneService/RemovePhoto" => {
+                    #[allow(non_camel_case_types)]
+                    struct RemovePhotoSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::UnaryService<super::RemovePhotoRequest>
+                    for RemovePhotoSvc<T> {
+                        type Response = super::Scene;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::RemovePhotoRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::remove_photo(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = RemovePhotoSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

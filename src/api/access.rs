@@ -32,6 +32,7 @@ const SERVICES: [(&str, Rpcs); 2] = [
     (
         "/segsplat.v1.SceneService/",
         &[
+            ("AddPhotos", "add_photos", WRITE),
             ("CreateScene", "create_scene", WRITE),
             ("DeleteScene", "delete_scene", WRITE),
             ("Export", "export", READ),
@@ -43,6 +44,7 @@ const SERVICES: [(&str, Rpcs); 2] = [
             ("Pick", "pick", READ),
             ("Query", "query", READ),
             ("RefineScene", "refine_scene", WRITE),
+            ("RemovePhoto", "remove_photo", WRITE),
             ("RenderView", "render_view", READ),
             ("RenderViews", "render_views", READ),
             ("SetEdits", "set_edits", WRITE),

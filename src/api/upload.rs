@@ -54,6 +54,8 @@ pub(super) struct UploadBuilder<'a> {
     current: Current,
     upload: Upload,
     names: HashSet<String>,
+    /// Photos that there must be.
+    photos_min: usize,
 }
 
 impl<'a> UploadBuilder<'a> {
@@ -65,7 +67,13 @@ impl<'a> UploadBuilder<'a> {
             current: Current::Nothing,
             upload: Upload::default(),
             names: HashSet::new(),
+            photos_min: limits.photos_min,
         }
+    }
+
+    /// The same for an upload of so many photos at least.
+    pub(super) fn at_least(self, photos_min: usize) -> Self {
+        Self { photos_min, ..self }
     }
 
     /// Begins the camera description, with the bytes that are in it.
@@ -142,7 +150,7 @@ impl<'a> UploadBuilder<'a> {
     /// The whole upload; its bytes count against the budget until the guard is dropped.
     pub(super) fn finish(self) -> Result<(Upload, UploadGuard)> {
         let upload = self.upload;
-        let (min, photos) = (self.limits.photos_min, upload.photos.len());
+        let (min, photos) = (self.photos_min, upload.photos.len());
         if upload.splats.is_some() {
             let others = photos > 0 || upload.cameras.is_some() || upload.archive.is_some();
             let why = "upload: a file of Gaussians is a whole scene; send it without other files";

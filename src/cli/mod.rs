@@ -4,6 +4,7 @@
 //! Answers go to standard output, as one JSON value with `--json`. Progress, the log and errors go
 //! to standard error. The error table has the exit code of each error.
 
+mod add;
 mod bench;
 mod camera;
 mod cameras;
@@ -61,6 +62,8 @@ enum Command {
     Health(Box<health::Args>),
     /// Make a scene of a folder (or archive) of photos, with their cameras or without
     Reconstruct(reconstruct::Args),
+    /// Add posed photos to a scene of a running server
+    Add(add::Args),
     /// Find the cameras of photos, and write them as a transforms.json
     Cameras(cameras::Args),
     /// Render a view of a scene
@@ -90,6 +93,7 @@ impl Command {
             Self::Serve(args) => args.config.clone(),
             Self::Health(args) => AllArgs { listen: args.listen.clone(), ..AllArgs::default() },
             Self::Reconstruct(args) => common(&args.config),
+            Self::Add(args) => common(&args.config),
             Self::Cameras(args) => common(&args.config),
             Self::Render(args) => common(&args.config),
             Self::Query(args) => common(&args.config),
@@ -162,6 +166,7 @@ fn dispatch(cli: &Cli, out: &Output) -> Result<()> {
         Command::Keys(args) => keys::run(args, out),
         Command::Health(args) => health::run(args, &config, out),
         Command::Reconstruct(args) => reconstruct::run(args, &config, out),
+        Command::Add(args) => add::run(args, &config, out),
         Command::Cameras(args) => cameras::run(args, &config, out),
         Command::Render(args) => render::run(args, &config, out),
         Command::Query(args) => query::run(args, &config, out),

@@ -4,10 +4,10 @@ use super::kind::Kind;
 use crate::{
     error::Error,
     scene::{
-        RefineReport, RefineState, RefineStatus, Scene, SceneError, SceneState, SemanticsMode,
-        SemanticsReport, SemanticsState, SemanticsStatus,
+        GrowthStatus, Refine, RefineReport, RefineState, RefineStatus, Scene, SceneError,
+        SceneState, SemanticsMode, SemanticsReport, SemanticsState, SemanticsStatus,
     },
-    store::{Record, RefineOrder},
+    store::{PhotoChange, Record, RefineOrder},
 };
 
 /// A change of the record of a scene.
@@ -30,6 +30,12 @@ pub(super) enum Change<'a> {
     RefineOrdered(RefineOrder),
     /// The refinement is over with this result, or it was called off.
     RefineEnded(Option<&'a RefineReport>),
+    /// Photos are to join the scene, or to leave it. A refinement that waits or is at work begins
+    /// again after that.
+    PhotosOrdered(&'a PhotoChange),
+    /// The version in which the first change of photos is done is in the store; it is to be refined
+    /// where there is an order.
+    Grown(&'a Scene, Option<RefineOrder>),
     /// A job has failed.
     Failed(Kind, &'a Error),
     /// A job needs what another version of the program wrote: it is shown as failed, and the store
@@ -124,6 +130,11 @@ impl Change<'_> {
                 }
                 refine_ended(record, *report);
             }
+            Self::PhotosOrdered(change) => return ordered(record, change),
+            Self::Grown(scene, order) => {
+                grown(record, scene, *order);
+                record.status.updated_ms = now_ms;
+            }
             Self::Failed(kind, error) | Self::Left(kind, error) => {
                 kind.failed(record, SceneError::from(*error), now_ms);
             }
@@ -159,6 +170,55 @@ fn made(record: &mut Record, scene: &Scene, order: Option<RefineOrder>) {
     {
         record.status.semantics = SemanticsStatus::new(SemanticsState::Running);
     }
+}
+
+/// Whether the change can be done after those that wait: it names no photo that is there already,
+/// or none that is not.
+fn ordered(record: &mut Record, change: &PhotoChange) -> bool {
+    let there = record.photos_to_be();
+    let fits = match change {
+        PhotoChange::Add(added) => !added.files.iter().any(|file| there.contains(&&**file)),
+        PhotoChange::Remove(file) => there.contains(&&**file),
+    };
+    if record.status.state != SceneState::Done || !fits {
+        return false;
+    }
+    if let Some(order) = record.refine {
+        record.growth.refine = Some(Refine::Ms(order.ms));
+        forget_refinement(record);
+    }
+    record.growth.waiting.push_back(change.clone());
+    let before = std::mem::take(&mut record.status.growth);
+    record.status.growth =
+        GrowthStatus { stage: before.stage, fraction: before.fraction, ..record.growth.status() };
+    true
+}
+
+fn grown(record: &mut Record, scene: &Scene, order: Option<RefineOrder>) {
+    shows(record, scene);
+    record.content_sha256 = Some(scene.meta.provenance.content_sha256.clone());
+    record.status.version += 1;
+    record.growth.attempts = 0;
+    if let Some(PhotoChange::Add(added)) = record.growth.waiting.pop_front() {
+        record.growth.joined.push(added);
+    }
+    record.status.growth = GrowthStatus::of(waiting(record));
+    if record.growth.waiting.is_empty() {
+        record.growth.refine = None;
+        record.status.growth.fraction = 1.0;
+    }
+    if let Some(semantics) = &scene.semantics {
+        record.semantics_sha256 = Some(scene.semantics_sha256.clone());
+        record.status.semantics = SemanticsStatus::ready(semantics.report.clone());
+    }
+    if order.is_some() && record.refine.is_none() {
+        refine(record, order);
+    }
+}
+
+/// Changes of the photos that wait.
+pub(super) fn waiting(record: &Record) -> u32 {
+    u32::try_from(record.growth.waiting.len()).unwrap_or(u32::MAX)
 }
 
 /// The record says what the scene says of itself.

@@ -1,13 +1,14 @@
 //! Jobs: a bounded queue, workers, progress for watchers, and a way to stop each job.
 //!
-//! A job makes a scene of an upload, or the semantics of a scene, or refines it: `KINDS` lists the
-//! kinds, each of which is one file with a `JobKind` and its `Work`. In: an upload, safe in the
+//! A job makes a scene of an upload, or the semantics of a scene, or changes its photos, or refines
+//! it: `KINDS` lists the kinds, each of which is one file with a `JobKind` and its `Work`. In: an upload, safe in the
 //! store before `Jobs::submit` returns. Out: a scene in the store. Invariant: an acknowledged scene
 //! is made, fails with a code, or is cancelled, over any restart.
 
 mod background;
 mod bell;
 mod change;
+mod grow;
 mod job;
 mod kind;
 mod networks;
@@ -45,6 +46,7 @@ pub(crate) use self::shared::{JobParts, Jobs};
 use self::{
     bell::Bell,
     change::{Attempt, Change, forget_semantics_job},
+    grow::{GROW, GrowScene},
     job::{Reason, Running},
     photos::ReadUploads,
     queue::Queue,
@@ -63,7 +65,7 @@ use crate::{
 };
 
 /// Every kind of job.
-const KINDS: [&dyn Work; 3] = [&MakeScene, &MakeSemantics, &RefineScene];
+const KINDS: [&dyn Work; 4] = [&MakeScene, &MakeSemantics, &GrowScene, &RefineScene];
 
 /// Names of the kinds of job, as in metrics.
 pub fn kinds() -> impl Iterator<Item = &'static str> {
@@ -89,6 +91,7 @@ impl Jobs {
             replicas: replicas::of(&parts)?,
             workers: AtomicUsize::new(parts.workers),
             locked: Mutex::default(),
+            ordering: Mutex::default(),
             bell,
             scene_ms: AtomicU64::new(0),
             freed: AtomicBool::new(false),
@@ -163,11 +166,13 @@ impl Jobs {
             && self.parts.semantics.lacks().is_none()
             && ordered.apply(&mut record, now_ms);
         let refined = done && record.refine.is_some();
+        let grows = done && !record.growth.waiting.is_empty();
         self.records.insert(record.clone());
         if refined {
             self.mend(&record);
         }
-        for (kind, waits) in [(REFINE, refined), (SEMANTICS, eager), (SCENE, unfinished)] {
+        let waiting = [(REFINE, refined), (GROW, grows), (SEMANTICS, eager), (SCENE, unfinished)];
+        for (kind, waits) in waiting {
             if waits {
                 self.replicas.hold(&id);
                 self.queue.push(kind, id.clone(), owner.as_deref());

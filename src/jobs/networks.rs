@@ -7,7 +7,8 @@ use crate::{
     models::Provider,
     pipeline::{
         self, PhotoSet, Pipeline, PipelineLoader, Reconstruction, Seen, UnposedSet,
-        semantics::{SemanticsInput, label_photos},
+        growth::{self, Grown},
+        semantics::{LabelledPhotos, SemanticsInput, label_more},
         words,
     },
     refine::split,
@@ -108,6 +109,25 @@ pub trait SceneNetworks: Send + Sync {
         watch: Watch<'_>,
     ) -> Result<(Reconstruction, Option<Seen>)> {
         Ok((self.make(photos, options, watch)?, None))
+    }
+
+    /// The scene of photos of which the first `before` were there already: `known` is what the
+    /// networks said of these, as [`Self::make_keeping`] or this gave it.
+    ///
+    /// # Errors
+    /// As [`Self::make`].
+    fn make_more(
+        &self,
+        photos: &PhotoSet,
+        before: usize,
+        _known: Option<Seen>,
+        options: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<Grown> {
+        let made = self.make(photos, options, watch)?;
+        let source = made.gaussians.source();
+        let of_new = made.gaussians.only(|i| usize::from(source[i].view) >= before);
+        Ok(Grown { made, of_new, seen: None })
     }
 
     /// The scene of the photos but those of the numbers `held`, and the Gaussians with which its
@@ -226,6 +246,22 @@ pub trait SemanticNetworks: Send + Sync {
         scene: &dyn Fn() -> Result<Arc<Scene>>,
         watch: Watch<'_>,
     ) -> Result<Semantics>;
+
+    /// As [`Self::make`], where the first photos were labelled before (`known`); also the labels of
+    /// all photos, for the next time, where they can be used again.
+    ///
+    /// # Errors
+    /// As [`Self::make`].
+    fn make_more(
+        &self,
+        photos: &[PosedPhoto],
+        _known: Option<&LabelledPhotos>,
+        method: &Method,
+        scene: &dyn Fn() -> Result<Arc<Scene>>,
+        watch: Watch<'_>,
+    ) -> Result<(Semantics, Option<LabelledPhotos>)> {
+        Ok((self.make(photos, method, scene, watch)?, None))
+    }
 }
 
 /// Makes no semantics: the bundle has no networks for them.
@@ -323,6 +359,17 @@ impl SceneNetworks for PipelineNetworks {
         Ok((made, Some(seen)))
     }
 
+    fn make_more(
+        &self,
+        photos: &PhotoSet,
+        before: usize,
+        known: Option<Seen>,
+        options: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<Grown> {
+        growth::make_more(self.0.get()?, photos, before, known, options, watch)
+    }
+
     fn make_for_refinement(
         &self,
         photos: &PhotoSet,
@@ -399,12 +446,27 @@ impl SemanticNetworks for PipelineNetworks {
         scene: &dyn Fn() -> Result<Arc<Scene>>,
         watch: Watch<'_>,
     ) -> Result<Semantics> {
+        let made = SemanticNetworks::make_more(self, photos, None, method, scene, watch);
+        made.map(|(semantics, _)| semantics)
+    }
+
+    fn make_more(
+        &self,
+        photos: &[PosedPhoto],
+        known: Option<&LabelledPhotos>,
+        method: &Method,
+        scene: &dyn Fn() -> Result<Arc<Scene>>,
+        watch: Watch<'_>,
+    ) -> Result<(Semantics, Option<LabelledPhotos>)> {
         let engine = self.0.get()?;
         let seeds = if method.seeds { Some(scene()?) } else { None };
         let gaussians = seeds.as_ref().map(|scene| &scene.gaussians);
-        let labelled = label_photos(engine, photos, gaussians, method, watch)?;
+        let labelled = label_more(engine, photos, known, gaussians, method, watch)?;
         let scene = scene()?;
         let (cameras, gaussians) = (&scene.meta.cameras[..], &scene.gaussians);
-        labelled.label_gaussians(&SemanticsInput { photos, cameras, gaussians }, watch)
+        let input = SemanticsInput { photos, cameras, gaussians };
+        // Seeded masks depend on the photos before: they are of no use beside others.
+        let kept = (!method.seeds).then(|| labelled.clone());
+        Ok((labelled.label_gaussians(&input, watch)?, kept))
     }
 }

@@ -12,7 +12,7 @@ use crate::{
     error::{Error, Result},
     formats::table::read_splats,
     limits::Limits,
-    pipeline::{self, PhotoSet, ReadSet, Seen, UnposedSet},
+    pipeline::{self, PhotoSet, ReadSet, Seen, UnposedSet, semantics::LabelledPhotos},
     scene::{
         PhotoHash, Scene, SceneId, SceneOptions, SceneStatus, SemanticsMode, Stage, StageTime,
         Upload,
@@ -144,11 +144,13 @@ pub(super) struct ReadUploads {
     uploads: Mutex<HashMap<SceneId, Kept>>,
 }
 
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct Kept {
     upload: Arc<ReadUpload>,
-    /// What the networks said of its photos, for a refinement that waits.
+    /// What the networks said of its photos, for a refinement, and for photos that join it.
     seen: Option<Arc<Seen>>,
+    /// What its photos mean, for photos that join it.
+    labelled: Option<Arc<LabelledPhotos>>,
     /// End of its time; none where a job waits for it.
     until: Option<Instant>,
 }
@@ -159,7 +161,9 @@ impl Kept {
     }
 
     fn size_bytes(&self) -> u64 {
-        self.upload.size_bytes() + self.seen.as_ref().map_or(0, |seen| seen.size_bytes())
+        self.upload.size_bytes()
+            + self.seen.as_ref().map_or(0, |seen| seen.size_bytes())
+            + self.labelled.as_ref().map_or(0, |labelled| labelled.size_bytes())
     }
 }
 
@@ -171,20 +175,29 @@ impl ReadUploads {
     /// Keeps an upload until it is forgotten, where it fits. Those that wait for a first text make
     /// room, the oldest first.
     pub(super) fn keep(&self, id: &SceneId, upload: Arc<ReadUpload>) {
-        self.insert(id, Kept { upload, seen: None, until: None });
+        self.insert(id, Kept { upload, seen: None, labelled: None, until: None });
     }
 
     /// Keeps an upload for a first text, where it fits.
     pub(super) fn leave(&self, id: &SceneId, upload: Arc<ReadUpload>) {
         let until = Some(Instant::now() + self.left_for);
-        self.insert(id, Kept { upload, seen: None, until });
+        self.insert(id, Kept { upload, seen: None, labelled: None, until });
     }
 
-    fn insert(&self, id: &SceneId, new: Kept) {
+    /// What the photos mean and what the networks said are kept only where they fit beside the
+    /// upload.
+    fn insert(&self, id: &SceneId, mut new: Kept) {
         let mut uploads = self.uploads.lock();
         uploads.remove(id);
         let needed = uploads.values().filter(|kept| kept.until.is_none());
-        if needed.map(Kept::size_bytes).sum::<u64>() + new.size_bytes() > self.bytes_max {
+        let room = self.bytes_max.saturating_sub(needed.map(Kept::size_bytes).sum());
+        if new.size_bytes() > room {
+            new.labelled = None;
+        }
+        if new.size_bytes() > room {
+            new.seen = None;
+        }
+        if new.size_bytes() > room {
             return;
         }
         let all = |uploads: &HashMap<_, Kept>| uploads.values().map(Kept::size_bytes).sum::<u64>();
@@ -199,19 +212,29 @@ impl ReadUploads {
 
     /// Keeps what the networks said of the photos beside an upload that is here, where it fits.
     pub(super) fn keep_seen(&self, id: &SceneId, seen: Seen) {
+        self.keep_more(id, |kept| Kept { seen: Some(Arc::new(seen)), ..kept });
+    }
+
+    /// Keeps what the photos mean beside an upload that is here, where it fits.
+    pub(super) fn keep_labelled(&self, id: &SceneId, labelled: LabelledPhotos) {
+        self.keep_more(id, |kept| Kept { labelled: Some(Arc::new(labelled)), ..kept });
+    }
+
+    fn keep_more(&self, id: &SceneId, with: impl FnOnce(Kept) -> Kept) {
         let kept = self.uploads.lock().remove(id);
         if let Some(kept) = kept {
-            let without = Kept { upload: Arc::clone(&kept.upload), ..kept };
-            self.insert(id, Kept { seen: Some(Arc::new(seen)), ..kept });
-            if self.find(id).is_none() {
-                self.insert(id, without);
-            }
+            self.insert(id, with(kept));
         }
     }
 
-    /// Takes what the networks said of the photos.
-    pub(super) fn take_seen(&self, id: &SceneId) -> Option<Arc<Seen>> {
-        self.uploads.lock().get_mut(id)?.seen.take()
+    /// What the photos mean.
+    pub(super) fn find_labelled(&self, id: &SceneId) -> Option<Arc<LabelledPhotos>> {
+        self.uploads.lock().get(id)?.labelled.clone()
+    }
+
+    /// What the networks said of the photos.
+    pub(super) fn find_seen(&self, id: &SceneId) -> Option<Arc<Seen>> {
+        self.uploads.lock().get(id)?.seen.clone()
     }
 
     pub(super) fn find(&self, id: &SceneId) -> Option<Arc<ReadUpload>> {

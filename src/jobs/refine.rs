@@ -32,7 +32,7 @@ use crate::{
     refine::{RefineBudget, RefineOptions, RefinedVersion},
     scene::{
         Refine, RefineReport, RefineState, RefineStatus, Scene, SceneError, SceneId, SceneStatus,
-        Stage, Watch,
+        Stage, Watch, unless_cancelled,
     },
     store::{Record, RefineOrder},
 };
@@ -153,8 +153,11 @@ impl Jobs {
     /// Where a version was published and its record was not: the record of that version.
     pub(super) fn mend(&self, record: &Record) {
         let id = &record.status.id;
+        // Of photos that join the job that adds them tells.
+        let grows = !record.growth.waiting.is_empty();
         let Ok(scene) = self.parts.store.scene(id) else { return };
-        if record.scene_sha256.as_ref() != Some(&scene.sha256)
+        if !grows
+            && record.scene_sha256.as_ref() != Some(&scene.sha256)
             && let Err(error) = self.records.apply(id, &Change::Published(&scene))
         {
             tracing::error!(scene = %id, %error, "its status is not kept");
@@ -178,7 +181,8 @@ impl Jobs {
         let options = refine_options(order.ms, &self.parts.limits.get());
         let scenes = &self.parts.scenes;
         // The networks run again where what they said is not here any more.
-        let seen = match self.uploads.take_seen(id) {
+        let seen = self.uploads.find_seen(id);
+        let seen = match seen.filter(|seen| seen.photos() == photos.photos.len()) {
             Some(seen) => Some(seen),
             None => scenes.make_keeping(photos, &record.options, watch)?.1.map(Arc::new),
         };
@@ -225,6 +229,7 @@ impl Jobs {
         let (id, store) = (&job.scene, &self.parts.store);
         // No semantics are made of Gaussians that are replaced meanwhile.
         let _lock = self.lock(id.as_str(), job)?;
+        self.unless_grown_elsewhere(job)?;
         let served = store.scene(id)?;
         let scene = store.put_version(version_of(start, &served, version)?)?;
         let published = self.records.apply(id, &Change::Published(&scene))?.after;
@@ -233,9 +238,19 @@ impl Jobs {
         Ok(())
     }
 
+    /// Ends the refinement of a scene whose photos another replica changes.
+    /// Fails with `cancelled`, and as the store does.
+    fn unless_grown_elsewhere(&self, job: &Job) -> Result<()> {
+        if self.replicas.grows_elsewhere(&self.parts.store, &job.scene)? {
+            job.stop(Reason::Cancelled);
+        }
+        unless_cancelled(&job.cancel)
+    }
+
     fn finish_refinement(&self, job: &Job, found: &RefineReport) -> Result<()> {
         let id = &job.scene;
         let _lock = self.lock(id.as_str(), job)?;
+        self.unless_grown_elsewhere(job)?;
         let found = reported(self.record(id)?.status.cameras.len(), found);
         self.records.apply(id, &Change::RefineEnded(Some(&found)))?;
         tracing::info!(scene = %id, steps = found.steps, "refinement is over");

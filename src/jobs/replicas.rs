@@ -14,12 +14,13 @@ use parking_lot::Mutex;
 
 use super::{
     change::{Attempt, Change, forget_refinement, forget_semantics_job},
+    grow::GROW,
     job::Reason,
     scene::SCENE,
     shared::{JobParts, Jobs, Replicas},
 };
 use crate::{
-    error::Result,
+    error::{Error, ErrorCode, Result},
     limits::LiveLimits,
     scene::SceneId,
     store::{self, Record, Store},
@@ -127,6 +128,22 @@ impl Replicas for OtherReplicas {
         store.was_acknowledged(id)
     }
 
+    fn begin_growing(&self, store: &Store, id: &SceneId) -> Result<()> {
+        if store.begin_growing(id, &self.name)? == self.name {
+            return Ok(());
+        }
+        let why = format!("another replica changes the photos of scene {id}; ask again");
+        Err(Error::new(ErrorCode::Overloaded, why).retry_after_s(1))
+    }
+
+    fn grows_elsewhere(&self, store: &Store, id: &SceneId) -> Result<bool> {
+        Ok(store.grows_at(id)?.is_some_and(|replica| replica != self.name))
+    }
+
+    fn end_growing(&self, store: &Store, id: &SceneId) -> Result<()> {
+        if self.grows_elsewhere(store, id)? { Ok(()) } else { store.end_growing(id) }
+    }
+
     fn watch(&self, jobs: &Jobs) {
         let mut seen = Seen::default();
         let mut beaten: Option<Instant> = None;
@@ -213,6 +230,7 @@ impl OtherReplicas {
             }
         }
         let alive = self.alive(jobs, seen)?;
+        self.grow_for_dead(jobs, &alive)?;
         self.take_over_from_dead(jobs, seen, &alive)
     }
 
@@ -282,6 +300,30 @@ impl OtherReplicas {
                 self.take_over(jobs, &id, &replica)?;
             }
             seen.replica_of.insert(id, heir);
+        }
+        Ok(())
+    }
+
+    /// Goes on with changes of photos that dead replicas took.
+    fn grow_for_dead(&self, jobs: &Jobs, alive: &HashSet<String>) -> Result<()> {
+        let store = &jobs.parts.store;
+        for id in store.growing()? {
+            let Some(replica) = store.grows_at(&id)? else { continue };
+            let lives = replica == self.name || alive.contains(&replica);
+            if lives || store.claim(&id, &replica, &self.name)? != self.name {
+                continue;
+            }
+            let Some(record) = store.record(&id)? else { continue };
+            if record.growth.waiting.is_empty() {
+                store.end_growing(&id)?;
+                continue;
+            }
+            tracing::info!(scene = %id, from = replica, "its photos change here now");
+            store.go_on_growing(&id, &self.name)?;
+            let owner = record.owner.clone();
+            self.hold(&id);
+            jobs.records.learn(record, || false);
+            jobs.queue.push(GROW, id, owner.as_deref());
         }
         Ok(())
     }

@@ -171,6 +171,9 @@ impl Jobs {
                 self.uploads.forget(id);
                 return of_file(upload, id, created_ms, provenance);
             };
+            // By a refinement, or by photos that join the scene.
+            let is_needed =
+                self.parts.keep_photos || self.is_refined_next(record, photos.photos.len());
             match record.options.semantics {
                 SemanticsMode::Eager => {
                     self.uploads.keep(id, Arc::clone(&upload));
@@ -181,12 +184,10 @@ impl Jobs {
                     }
                 }
                 SemanticsMode::Lazy => self.uploads.leave(id, Arc::clone(&upload)),
-                SemanticsMode::Off if self.is_refined_next(record, photos.photos.len()) => {
-                    self.uploads.leave(id, Arc::clone(&upload));
-                }
+                SemanticsMode::Off if is_needed => self.uploads.leave(id, Arc::clone(&upload)),
                 SemanticsMode::Off => self.uploads.forget(id),
             }
-            let made = match self.is_refined_next(record, photos.photos.len()) {
+            let made = match is_needed {
                 false => self.parts.scenes.make(photos, &record.options, watch)?,
                 true => {
                     let made = self.parts.scenes.make_keeping(photos, &record.options, watch)?;
@@ -290,7 +291,7 @@ impl Jobs {
     }
 
     /// Puts a finished scene where its views are drawn. It is whole without that.
-    fn prepare(&self, scene: &Scene) {
+    pub(super) fn prepare(&self, scene: &Scene) {
         let put = AssertUnwindSafe(|| self.parts.renderer.prepare(&scene.gaussians));
         let panicked = |_| Err(Error::internal("a panic"));
         if let Err(error) = catch_unwind(put).unwrap_or_else(panicked) {

@@ -182,7 +182,11 @@ impl Jobs {
             let photos = &upload.photos()?.photos;
             let photos_max = self.parts.limits.get().photos_max;
             let _room = self.room.take(photos.len(), photos_max, watch.cancel)?;
-            self.parts.semantics.make(photos, &method, &|| self.made_scene(job), watch)
+            let made = || self.made_scene(job);
+            let made = self.parts.semantics.make_more(photos, None, &method, &made, watch)?;
+            let (semantics, labelled) = made;
+            labelled.into_iter().for_each(|labelled| self.uploads.keep_labelled(id, labelled));
+            Ok(semantics)
         })?;
         let (report, packed) = (semantics.report.clone(), store.pack_semantics(id, semantics)?);
         let sha256 = packed.file_sha256().to_owned();

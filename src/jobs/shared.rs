@@ -84,6 +84,22 @@ pub(super) trait Replicas: Send + Sync {
         Ok(true)
     }
 
+    /// From now on this process changes the photos of a scene.
+    /// Fails with `overloaded` where another one does.
+    fn begin_growing(&self, _: &Store, _: &SceneId) -> Result<()> {
+        Ok(())
+    }
+
+    /// Whether another process changes the photos of a scene.
+    fn grows_elsewhere(&self, _: &Store, _: &SceneId) -> Result<bool> {
+        Ok(false)
+    }
+
+    /// No change of the photos of a scene waits any more.
+    fn end_growing(&self, _: &Store, _: &SceneId) -> Result<()> {
+        Ok(())
+    }
+
     /// The life of the thread that watches the other replicas.
     fn watch(&self, _: &Jobs) {}
 }
@@ -125,6 +141,8 @@ pub(crate) struct Jobs {
     pub(super) workers: AtomicUsize,
     /// Content hashes that workers make scenes of, and ids of scenes that they change.
     pub(super) locked: Mutex<HashSet<String>>,
+    /// Held while a change of photos is ordered, or the last one is over.
+    pub(super) ordering: Mutex<()>,
     /// Wakes threads that wait for a record, a lock, room or the end of a job.
     pub(super) bell: Arc<Bell>,
     /// Milliseconds that the last scenes took, smoothed; 0 before the first.
@@ -252,14 +270,14 @@ impl Jobs {
 
     /// The upload of a job: as the create call read it, else read from the store.
     pub(super) fn upload(&self, id: &SceneId, watch: Watch<'_>) -> Result<Arc<ReadUpload>> {
-        if let Some(kept) = self.uploads.find(id) {
+        let record = self.record(id)?;
+        if let Some(kept) = self.uploads.find(id).filter(|kept| kept.fits(&record.status)) {
             return Ok(kept);
         }
         let upload = self.parts.store.upload(id)?;
-        let record = self.record(id)?;
         let limits = self.parts.limits.get();
         let read = ReadUpload::of(&upload, &record.options, &limits, watch.cancel)?;
-        Ok(Arc::new(read.of_scene(&record.status)))
+        self.with_joined(read.of_scene(&record.status), &record, watch).map(Arc::new)
     }
 
     /// Forgets the photos of a finished scene where they are not kept, and no job that may come

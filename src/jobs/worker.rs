@@ -17,7 +17,7 @@ use super::{
 };
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{SceneId, SceneState, SceneStatus, SemanticsState},
+    scene::{SceneId, SceneState},
     store::Record,
     telemetry::meter,
 };
@@ -66,13 +66,15 @@ impl Jobs {
     /// follow.
     fn leave(&self, job: &Job) {
         let id = &job.scene;
+        self.go_on_growing(job);
         if self.running.has(id) {
             return;
         }
         match self.records.find(id).as_ref().map(|record| &record.status) {
             // What follows is queued already, by this job or by a caller.
             Some(status) if !status.is_settled() || status.is_refined_now() => {}
-            Some(status) if job.kind == SCENE && is_open_to_texts(status) => {
+            // Its first text, or photos that join it, need not read its photos.
+            Some(status) if status.state == SceneState::Done && self.parts.keep_photos => {
                 self.uploads.renew(id);
                 self.replicas.release(id);
             }
@@ -160,9 +162,9 @@ impl Jobs {
             tracing::info!(scene = %id, code, %error, "{what} failed");
         }
         // One that is deleted meanwhile has no watchers.
-        if let Ok(failed) = self.records.apply(id, &Change::Failed(kind, error))
-            && failed.after.status.state == SceneState::Failed
-        {
+        let Ok(failed) = self.records.apply(id, &Change::Failed(kind, error)) else { return };
+        self.drop_given_up(&failed);
+        if failed.after.status.state == SceneState::Failed {
             // Those that began early are wanted no more.
             self.running.stop(Reason::Cancelled, |job| job.scene == *id && !job.kind.lasts());
         }
@@ -201,11 +203,6 @@ impl Jobs {
             }
         }
     }
-}
-
-/// Whether a first text may ask for semantics.
-fn is_open_to_texts(status: &SceneStatus) -> bool {
-    status.state == SceneState::Done && status.semantics.state == SemanticsState::None
 }
 
 /// Gives what is free in the heaps back to the system. The allocator keeps it otherwise.

@@ -157,7 +157,7 @@ impl Shared {
     }
 
     /// Held by a call with this key, so that two of them cannot both be the first.
-    fn key_lock(&self, key: &str) -> &tokio::sync::Mutex<()> {
+    pub(super) fn key_lock(&self, key: &str) -> &tokio::sync::Mutex<()> {
         let place = Sha256::digest(key)[0] as usize % KEY_LOCKS;
         &self.key_locks[place]
     }
@@ -178,6 +178,11 @@ fn check_request(
     }
     options.method().check()?;
     options.refine.map_or(Ok(()), |refine| refine::check_refine(refine, limits))?;
+    check_key(key)
+}
+
+/// Refuses an idempotency key that is empty or too long.
+pub(super) fn check_key(key: Option<&str>) -> Result<()> {
     match key.map(str::len) {
         Some(0) => Err(Error::invalid("the idempotency key is empty")),
         Some(bytes) if bytes > IDEMPOTENCY_KEY_BYTES_MAX => {

@@ -14,6 +14,7 @@ mod infer;
 mod memory;
 mod offline;
 mod page;
+mod photos;
 mod pick;
 mod query;
 mod refine;
@@ -42,9 +43,10 @@ pub use self::{
     offline::OfflineService,
     page::{VIEWER, ViewerPage},
     request::{
-        BackgroundSpec, Boxes, CameraFields, CameraSpec, CreateScene, FeatureKind, FeaturesSpec,
-        Format, LensSpec, MaskFormat, PageRequest, PickSpec, PictureKind, PictureOptions, PoseSpec,
-        QuerySpec, ScoringOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec,
+        AddPhotos, BackgroundSpec, Boxes, CameraFields, CameraSpec, CreateScene, FeatureKind,
+        FeaturesSpec, Format, LensSpec, MaskFormat, PageRequest, PickSpec, PictureKind,
+        PictureOptions, PoseSpec, QuerySpec, ScoringOptions, TextOptions, ViewOptions, ViewSpec,
+        ViewsSpec,
     },
     shared::{Parts, Service},
     times::ViewTimes,

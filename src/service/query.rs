@@ -301,16 +301,21 @@ mod tests {
         }
     }
 
-    #[test]
-    fn a_query_whose_caller_has_gone_scores_no_text() {
+    /// Gaussians side by side, so many of each entry in a place of its own, as a scene with this
+    /// bank.
+    fn rows_of(bank: Bank, counts: &[usize]) -> Arc<Scene> {
+        let at = |entry: usize, i: usize| [10.0 * entry as f32, 0.1 * i as f32, 2.0];
+        let of_entry = |(entry, &count): (usize, &usize)| (0..count).map(move |i| (entry, i));
+        let all: Vec<(usize, usize)> = counts.iter().enumerate().flat_map(of_entry).collect();
+        let count = all.len();
         let raw = RawGaussians {
-            means: vec![[0.0, 0.0, 2.0]],
-            quats: vec![[1.0, 0.0, 0.0, 0.0]],
-            scales: vec![[0.1; 3]],
-            opacities: vec![0.9],
-            sh: vec![[0.0; 3]],
-            semantic_index: vec![0],
-            source: vec![SourcePixel::default()],
+            means: all.iter().map(|&(entry, i)| at(entry, i)).collect(),
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; count],
+            scales: vec![[0.1; 3]; count],
+            opacities: vec![0.9; count],
+            sh: vec![[0.0; 3]; count],
+            semantic_index: vec![0; count],
+            source: vec![SourcePixel::default(); count],
             ..RawGaussians::default()
         };
         let meta = SceneMeta {
@@ -321,9 +326,14 @@ mod tests {
             provenance: Provenance::default(),
         };
         let scene = Scene::new(meta, Gaussians::sanitize(raw).unwrap().0, Backdrop::default());
-        let bank = Bank { dim: 2, rows: vec![1.0, 0.0] };
-        let semantics = Semantics { bank, index: vec![1], ..Semantics::default() };
-        let scene = Arc::new(scene.with_semantics(Arc::new(semantics)).unwrap());
+        let index = all.iter().map(|(entry, _)| *entry as u16 + 1).collect();
+        let semantics = Semantics { bank, index, ..Semantics::default() };
+        Arc::new(scene.with_semantics(Arc::new(semantics)).unwrap())
+    }
+
+    #[test]
+    fn a_query_whose_caller_has_gone_scores_no_text() {
+        let scene = rows_of(Bank { dim: 2, rows: vec![1.0, 0.0] }, &[1]);
         let limits = Limits::default();
         let backend = Arc::new(Backend::new(Arc::new(Blank), Arc::new(Blank), &[], &limits));
         let pose = PoseSpec::CameraToWorld(DMat4::IDENTITY.to_cols_array());
@@ -337,5 +347,22 @@ mod tests {
         assert_eq!((whole.results.len(), whole.results[0].gaussians), (1, 1));
         let stopped = answer(&mut Work::stopped()).unwrap_err();
         assert_eq!(stopped.code(), ErrorCode::Cancelled);
+    }
+
+    #[test]
+    fn the_part_that_fits_a_text_best_comes_first_however_small_it_is() {
+        // Nearly as good, the best, and in between.
+        let bank = Bank { dim: 2, rows: vec![1.0, 0.02, 1.0, 0.0, 1.0, 0.01] };
+        let scene = rows_of(bank, &[60, 20, 40]);
+        let limits = Limits::default();
+        let backend = Arc::new(Backend::new(Arc::new(Blank), Arc::new(Blank), &[], &limits));
+        let (of, asked) = (SemanticScene::new(scene).unwrap(), ["chair".to_owned()]);
+        let texts = SceneTexts::new(&backend, of, &ScoringChoice::default(), &asked, None).unwrap();
+        let spec = QuerySpec::default();
+        let found = answer(&texts, &limits, &spec, None, &mut Work::default()).unwrap();
+        let parts = &found.results[0].parts;
+        let sizes: Vec<u64> = parts.iter().map(|part| part.gaussians).collect();
+        assert_eq!(sizes, [20, 40, 60], "{parts:?}");
+        assert!(parts.is_sorted_by(|a, b| a.score > b.score));
     }
 }

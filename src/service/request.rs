@@ -29,6 +29,17 @@ pub struct CreateScene {
     pub request_id: Option<String>,
 }
 
+/// Photos that are to join a finished scene.
+#[derive(Clone, Debug, Default)]
+pub struct AddPhotos {
+    /// The photos and their cameras, in the scene's own frame.
+    pub upload: Upload,
+    /// Two calls with one key and the same photos add them once; other photos are refused.
+    pub idempotency_key: Option<String>,
+    /// How long to wait for the version that has them, capped by `limits.wait_ms_max`.
+    pub wait: Option<Duration>,
+}
+
 /// Which page of the list.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, IntoParams)]
 #[serde(default, deny_unknown_fields)]

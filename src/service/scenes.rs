@@ -7,7 +7,9 @@ use futures_util::{Stream, stream};
 use super::{request::PageRequest, shared::Service, tasks, types::Page};
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Event, SceneError, SceneId, SceneState, SceneStatus, SemanticsState, Stage},
+    scene::{
+        Event, RefineState, SceneError, SceneId, SceneState, SceneStatus, SemanticsState, Stage,
+    },
     store::Record,
 };
 
@@ -68,11 +70,24 @@ impl Service {
     /// # Errors
     /// `scene_not_found`.
     pub async fn watch(&self, id: &SceneId) -> Result<impl Stream<Item = Event> + Send + use<>> {
+        self.watch_for(id, false).await
+    }
+
+    /// As [`Self::watch`]; with `semantics` a scene that is made is watched until its semantics
+    /// are, too. They are begun by the first text, which may come later than this call.
+    ///
+    /// # Errors
+    /// As [`Self::watch`].
+    pub async fn watch_for(
+        &self,
+        id: &SceneId,
+        semantics: bool,
+    ) -> Result<impl Stream<Item = Event> + Send + use<>> {
         let watcher = self.inner.jobs.watch(self.scene(id).await?.id())?;
         let service = self.clone();
-        let first = Some((service, watcher, None));
+        let first = Some((service, watcher, semantics, None));
         Ok(stream::unfold(first, async |state| {
-            let (service, mut watcher, before) = state?;
+            let (service, mut watcher, semantics, before) = state?;
             loop {
                 if before.is_some() {
                     tokio::select! {
@@ -80,21 +95,25 @@ impl Service {
                         () = service.inner.stopped_waiting() => return None,
                     }
                 }
-                let status = watcher.borrow_and_update().status.clone();
+                let status = service.shown(watcher.borrow_and_update().status.clone());
+                // Of a scene that waits for its semantics alone there is no other version.
+                let versions = !semantics || status.refinement.state != RefineState::None;
                 let event = match service.event(&status) {
-                    Event::Done if before.as_ref().is_some_and(is_version) => {
+                    Event::Done if versions && before.as_ref().is_some_and(is_version) => {
                         let fraction = status.refinement.fraction;
                         Event::Version { version: status.version, fraction }
                     }
                     event => event,
                 };
                 // How far a refinement is, is told with the next version, or with its end.
-                let goes_on = status.is_refined_now();
+                let goes_on = status.is_refined_now()
+                    || semantics && awaits_semantics(&status, before.is_none());
                 if goes_on && before.as_ref().is_some_and(|before| same_version(before, &event)) {
                     continue;
                 }
                 let last = event.is_last() || is_version(&event);
-                let next = (!last || goes_on).then(|| (service, watcher, Some(event.clone())));
+                let next =
+                    (!last || goes_on).then(|| (service, watcher, semantics, Some(event.clone())));
                 return Some((event, next));
             }
         }))
@@ -103,6 +122,14 @@ impl Service {
     fn event(&self, status: &SceneStatus) -> Event {
         let semantics = &status.semantics;
         match status.state {
+            SceneState::Done if status.is_growing() => Event::Running {
+                stage: status
+                    .growth
+                    .stage
+                    .clone()
+                    .unwrap_or_else(|| Stage::SCENE[0].name().to_owned()),
+                fraction: status.growth.fraction,
+            },
             SceneState::Done if semantics.state == SemanticsState::Running => Event::Running {
                 stage: semantics
                     .stage
@@ -127,6 +154,17 @@ impl Service {
     }
 }
 
+/// Whether a scene that can be viewed may still get its semantics. Those that failed before a
+/// watcher came, as its first look shows, are tried again by the next text.
+fn awaits_semantics(status: &SceneStatus, first: bool) -> bool {
+    let open = match status.semantics.state {
+        SemanticsState::None | SemanticsState::Running => true,
+        SemanticsState::Failed => first,
+        SemanticsState::Off | SemanticsState::Ready => false,
+    };
+    open && status.semantics.available && status.state == SceneState::Done
+}
+
 /// Whether it says what is served of a scene that is done.
 fn is_version(event: &Event) -> bool {
     matches!(event, Event::Done | Event::Version { .. })
@@ -135,6 +173,7 @@ fn is_version(event: &Event) -> bool {
 fn same_version(one: &Event, other: &Event) -> bool {
     match (one, other) {
         (Event::Version { version: a, .. }, Event::Version { version: b, .. }) => a == b,
+        (Event::Done, Event::Done) => true,
         // A scene is done as its first version.
         (Event::Done, Event::Version { version, .. }) => *version == 1,
         _ => false,

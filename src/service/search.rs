@@ -389,6 +389,11 @@ impl SceneTexts {
         })
     }
 
+    /// Whether the texts were found in the scene's photos: entries are of these texts alone.
+    pub(super) fn is_of_photos(&self) -> bool {
+        self.of.tag != self.stored.tag
+    }
+
     /// What tells the first text, how it is scored and the scene from all others, in tags.
     pub(super) fn key(&self) -> Result<String> {
         let text = self.texts.first().map(|text| text.text.as_str());

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! scenes/ID/upload.segsplat     photos and cameras as sent, with the first record
+//! scenes/ID/added-*.segsplat    photos that joined it later, with the record before they did
 //! scenes/ID/scene.segsplat      the finished scene
 //! scenes/ID/semantics.segsplat  its semantics, once a text needed them
 //! scenes/ID/edits.json          its list of edits, once there was one
@@ -9,7 +10,7 @@
 //! scenes/ID/*.quarantined       an object that failed its checksum
 //! pending/ID                    the record of what is not over; gone soon after there is a status
 //! keys/HASH  contents/HASH      scene of an idempotency key, and of a content hash
-//! replicas/R claims/ID.R deleted/ID   only where replicas share the store: see `shared`
+//! replicas/R claims/ID.R growing/ID deleted/ID   only where replicas share the store: see `shared`
 //! probe/ID                      for a moment: whether a store that kept nothing does again
 //! ```
 //!
@@ -17,6 +18,7 @@
 //! while it has a status or a pending record; a sweep removes objects of scenes that have neither.
 //! A bad object is put aside, and the start goes on.
 
+mod added;
 mod edits;
 mod files;
 mod hashes;
@@ -46,7 +48,7 @@ pub use self::{
     hashes::{provenance, request_sha256},
     index::KeyUse,
     open::StoreLocation,
-    record::{Record, RefineOrder},
+    record::{AddedPhotos, Growth, PhotoChange, Record, RefineOrder},
     upload_file::hashes,
 };
 use crate::{

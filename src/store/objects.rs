@@ -3,8 +3,12 @@
 //! A put is there whole or not at all: a local folder writes a staging file, syncs and renames it;
 //! an S3-compatible store takes one PUT. The first argument of each call is what a failure says
 //! the store cannot do; the error is `store_unavailable`.
+//!
+//! A call that came too late may still do its work. So calls that change an object go one after the
+//! other, also where nobody waits for the first any more: what is deleted does not come back.
 
 use std::{
+    collections::HashMap,
     future::Future,
     path::{Path as FilePath, PathBuf},
     sync::{
@@ -57,6 +61,9 @@ pub(super) struct Listed {
     pub(super) age: Duration,
 }
 
+/// One lock an object that is being changed.
+type Turns = Mutex<HashMap<Path, Arc<tokio::sync::Mutex<()>>>>;
+
 /// Blocking calls to an object store.
 pub(super) struct Objects {
     store: Arc<dyn ObjectStore>,
@@ -67,6 +74,7 @@ pub(super) struct Objects {
     /// Runs the calls; taken when dropped.
     runtime: Option<Runtime>,
     timeout: Duration,
+    turns: Arc<Turns>,
     /// Held by the one call of [`Self::probe`] at a time.
     looking: Mutex<()>,
     /// Bytes of the largest object that was not kept; 0 once as many were kept again.
@@ -101,8 +109,8 @@ impl Objects {
             .build()
             .map_err(|e| Error::internal("the store's threads do not start").caused_by(e))?;
         let (own, refused) = (folder.as_deref().and_then(folder_id), AtomicUsize::new(0));
-        let looking = Mutex::default();
-        Ok(Self { store, folder, own, runtime: Some(runtime), timeout, looking, refused })
+        let (turns, looking) = (Arc::default(), Mutex::default());
+        Ok(Self { store, folder, own, runtime: Some(runtime), timeout, turns, looking, refused })
     }
 
     /// Fails where a local store is not the folder of the start any more. One that was moved away
@@ -142,6 +150,37 @@ impl Objects {
         answer.map_err(|fault| unavailable(what, fault))
     }
 
+    /// [`Self::run`] of a call that changes an object: it begins once those before it have ended,
+    /// and goes on where its time is over.
+    fn change<T: Send + 'static, F>(
+        &self,
+        what: &str,
+        path: &Path,
+        call: impl FnOnce(Arc<dyn ObjectStore>) -> F,
+    ) -> Result<T>
+    where
+        F: Future<Output = Result<T, Fault>> + Send + 'static,
+    {
+        let (turns, path) = (Arc::clone(&self.turns), path.clone());
+        self.run(what, |store| {
+            let call = call(store);
+            let in_turn = async move {
+                let turn = Arc::clone(turns.lock().entry(path.clone()).or_default());
+                let done = {
+                    let _turn = turn.lock().await;
+                    call.await
+                };
+                let mut turns = turns.lock();
+                // This one and that of the map.
+                if Arc::strong_count(&turn) == 2 {
+                    turns.remove(&path);
+                }
+                done
+            };
+            async { tokio::spawn(in_turn).await.map_err(fault)? }
+        })
+    }
+
     /// Keeps an object, whatever was there.
     pub(super) fn put(&self, what: &str, path: Path, bytes: impl Into<PutPayload>) -> Result<()> {
         let bytes: PutPayload = bytes.into();
@@ -155,7 +194,7 @@ impl Objects {
         let bytes: PutPayload = bytes.into();
         let file = self.folder.as_ref().map(|folder| folder.join(path.as_ref()));
         self.unless_moved(what).and_then(|()| {
-            self.run(what, |store| async move {
+            self.change(what, &path.clone(), |store| async move {
                 let mut tries = 0..FOLDER_GONE_MAX;
                 let kept = loop {
                     match store.put(&path, bytes.clone()).await {
@@ -218,7 +257,7 @@ impl Objects {
         let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
         let size = bytes.len();
         let kept = self.unless_moved(what).and_then(|()| {
-            self.run(what, |store| async move {
+            self.change(what, &path.clone(), |store| async move {
                 match store.put_opts(&path, bytes.into(), options).await {
                     Ok(_) => Ok(true),
                     Err(Fault::AlreadyExists { .. } | Fault::Precondition { .. }) => Ok(false),
@@ -250,7 +289,7 @@ impl Objects {
     /// does not).
     pub(super) fn delete(&self, what: &str, path: Path) -> Result<bool> {
         let folder = self.folder.clone();
-        self.run(what, |store| async move {
+        self.change(what, &path.clone(), |store| async move {
             let was_there = match store.delete(&path).await {
                 // The object went, and its folder, which another deletion emptied.
                 Err(fault) if folder_is_gone(&fault) => true,

@@ -33,8 +33,8 @@ const LOCK_WAIT: Duration = Duration::from_secs(1);
 const LOCK_LOOK: Duration = Duration::from_millis(20);
 
 /// All that a store puts into its folder or bucket lies under these.
-const PREFIXES: [&str; 8] =
-    ["scenes", "pending", "keys", "contents", "replicas", "claims", "deleted", PROBE];
+const PREFIXES: [&str; 9] =
+    ["scenes", "pending", "keys", "contents", "replicas", "claims", "growing", "deleted", PROBE];
 
 /// Where scenes are kept.
 #[derive(Clone, Debug)]
@@ -270,11 +270,13 @@ fn from_scene(store: &Store, id: &SceneId) -> Result<Option<Record>> {
     if meta.id != *id {
         return Ok(None);
     }
+    let growth = store.growth_of(&meta)?;
     let status = SceneStatus {
         fraction: 1.0,
         report: Some(meta.report),
         cameras: meta.cameras,
         version: 1,
+        growth: growth.status(),
         ..SceneStatus::new(id.clone(), SceneState::Done, meta.created_ms)
     };
     // Without the upload only an admin sees it: better than the wrong owner.
@@ -283,6 +285,7 @@ fn from_scene(store: &Store, id: &SceneId) -> Result<Option<Record>> {
         owner,
         options: meta.provenance.options,
         attempts: 1,
+        growth,
         scene_sha256: Some(sha256),
         content_sha256: Some(meta.provenance.content_sha256).filter(|hash| !hash.is_empty()),
         ..Record::new(status)

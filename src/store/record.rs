@@ -1,12 +1,14 @@
 //! What the store keeps of a scene beside its arrays: status, request, attempts.
 
+use std::collections::VecDeque;
+
 use serde::{Deserialize, Serialize};
 
 use crate::{
     error::{Error, ErrorCode, Result},
     formats::container::unread_json,
     names::hex,
-    scene::{SceneOptions, SceneStatus},
+    scene::{GrowthStatus, Refine, SceneOptions, SceneStatus},
 };
 use sha2::{Digest, Sha256};
 
@@ -18,6 +20,68 @@ pub struct RefineOrder {
     /// How often it was begun since it last published a version; bounds how often one that stops
     /// the server is begun again.
     pub attempts: u32,
+}
+
+/// Photos that join a scene after it was made, or leave it: what goes on after any restart.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Growth {
+    /// Uploads whose photos joined it, in their order.
+    pub joined: Vec<AddedPhotos>,
+    /// What is still to be done, in the order of the calls.
+    pub waiting: VecDeque<PhotoChange>,
+    /// How often the first of these was begun; bounds how often one that stops the server is begun
+    /// again.
+    pub attempts: u32,
+    /// Whether the scene is to be refined when nothing waits any more: it was when a call came.
+    pub refine: Option<Refine>,
+}
+
+/// A change of the photos of a scene.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PhotoChange {
+    /// They join it.
+    Add(AddedPhotos),
+    /// The photo of this file name leaves it.
+    Remove(String),
+}
+
+/// An upload whose photos join a scene.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AddedPhotos {
+    /// Name of its object, beside those of the scene.
+    pub object: String,
+    /// File names of its photos.
+    pub files: Vec<String>,
+    /// Idempotency key of the call.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub idempotency_key: Option<String>,
+    /// sha256 over the upload, hex: what the key stands for.
+    pub request_sha256: String,
+}
+
+impl Growth {
+    fn is_empty(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// What callers are told of it.
+    pub fn status(&self) -> GrowthStatus {
+        match self.joined.is_empty() && self.waiting.is_empty() {
+            true => GrowthStatus::default(),
+            false => GrowthStatus::of(u32::try_from(self.waiting.len()).unwrap_or(u32::MAX)),
+        }
+    }
+
+    /// The uploads that joined or wait.
+    pub fn added(&self) -> impl Iterator<Item = &AddedPhotos> {
+        let waiting = self.waiting.iter().filter_map(|change| match change {
+            PhotoChange::Add(added) => Some(added),
+            PhotoChange::Remove(_) => None,
+        });
+        self.joined.iter().chain(waiting)
+    }
 }
 
 /// A scene's status and the request it came from.
@@ -39,6 +103,9 @@ pub struct Record {
     /// The refinement that waits or is at work.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub refine: Option<RefineOrder>,
+    /// Photos that joined it, and changes of its photos that wait.
+    #[serde(default, skip_serializing_if = "Growth::is_empty")]
+    pub growth: Growth,
     /// sha256 of the scene container, hex, once done.
     pub scene_sha256: Option<String>,
     /// sha256 of the semantics container, hex, once they are ready.
@@ -59,6 +126,18 @@ pub struct Record {
 }
 
 impl Record {
+    /// File names of the photos of a finished scene, once all that waits is done.
+    pub fn photos_to_be(&self) -> Vec<&str> {
+        let mut files: Vec<&str> = self.status.cameras.iter().map(|of| &*of.file).collect();
+        for change in &self.growth.waiting {
+            match change {
+                PhotoChange::Add(added) => files.extend(added.files.iter().map(String::as_str)),
+                PhotoChange::Remove(gone) => files.retain(|file| file != gone),
+            }
+        }
+        files
+    }
+
     /// A record of which nothing but the status is known.
     pub fn new(status: SceneStatus) -> Self {
         Self {
@@ -69,6 +148,7 @@ impl Record {
             request_sha256: String::new(),
             attempts: 0,
             refine: None,
+            growth: Growth::default(),
             scene_sha256: None,
             semantics_sha256: None,
             content_sha256: None,

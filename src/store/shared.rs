@@ -4,6 +4,8 @@
 //!   lease counts as dead; no clocks are compared.
 //! - `claims/ID.R`: who makes scene ID in place of R. Created once, so there is one heir; where the
 //!   heir dies too, its own name begins the next claim.
+//! - `growing/ID`: the replica that changes the photos of scene ID, as long as changes wait. One at
+//!   a time, so that no call's photos get lost between two records.
 //! - `deleted/ID`: a tombstone. A job that still makes ID removes what it wrote.
 //!
 //! Each call fails with `store_unavailable` where the store does.
@@ -14,6 +16,10 @@ use object_store::path::Path as Name;
 
 use super::{Record, SCENE, STATUS, Store, UPLOAD, of, open, pending};
 use crate::{error::Result, scene::SceneId};
+
+fn growing(id: &SceneId) -> Name {
+    Name::from(format!("growing/{id}"))
+}
 
 impl Store {
     /// Writes the heartbeat of `replica`; `count` differs from beat to beat.
@@ -67,6 +73,38 @@ impl Store {
             }
         }
         Ok(())
+    }
+
+    /// Lets `replica` change the photos of a scene, unless another does; gives the one that does.
+    pub(crate) fn begin_growing(&self, id: &SceneId, replica: &str) -> Result<String> {
+        let (what, path) = ("change the photos of a scene", growing(id));
+        if self.objects.create(what, path.clone(), replica.as_bytes().to_vec())? {
+            return Ok(replica.to_owned());
+        }
+        Ok(self.grows_at(id)?.unwrap_or_else(|| replica.to_owned()))
+    }
+
+    /// The replica that changes the photos of a scene.
+    pub(crate) fn grows_at(&self, id: &SceneId) -> Result<Option<String>> {
+        let found = self.objects.get("change the photos of a scene", growing(id))?;
+        Ok(found.map(|name| String::from_utf8_lossy(&name).into_owned()))
+    }
+
+    /// `heir` changes the photos of a scene in place of another.
+    pub(crate) fn go_on_growing(&self, id: &SceneId, heir: &str) -> Result<()> {
+        let what = "change the photos of a scene";
+        self.objects.put(what, growing(id), heir.as_bytes().to_vec())
+    }
+
+    /// No change of the photos of a scene waits.
+    pub(crate) fn end_growing(&self, id: &SceneId) -> Result<()> {
+        self.objects.delete("change the photos of a scene", growing(id)).map(drop)
+    }
+
+    /// Scenes whose photos change.
+    pub(crate) fn growing(&self) -> Result<Vec<SceneId>> {
+        let listed = self.listed("growing", |name| name.parse().ok())?;
+        Ok(listed.into_iter().map(|(id, _)| id).collect())
     }
 
     /// Scenes that were deleted not long ago.

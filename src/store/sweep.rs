@@ -27,7 +27,8 @@ impl Store {
             // What is named otherwise is not ours.
             orphans.extend(id.map(|id: SceneId| (id, object)));
         }
-        for object in self.objects.list(SWEEP, "claims")? {
+        let claims = self.objects.list(SWEEP, "claims")?;
+        for object in claims.into_iter().chain(self.objects.list(SWEEP, "growing")?) {
             let id = object.path.filename().and_then(|name| name.split('.').next()?.parse().ok());
             orphans.extend(id.map(|id: SceneId| (id, object)));
         }

@@ -12,20 +12,27 @@ use segsplat::{
     error::TABLE,
     keys::{Scope, key_sha256},
     limits::Limits,
+    sample::{self, SampleOptions},
+    scene::Upload,
 };
 
 use crate::common::{
-    doors::{Ask, Door, Fault, Options, both, both_named, both_with, bytes, fault_of},
+    doors::{
+        Ask, Door, Fault, Options, adding, both, both_named, both_with, bytes, fault_of, form,
+    },
+    process::photos_of,
     server::{TestServer, upload},
 };
 
 /// Every call, named as the gRPC methods are, and what it needs.
-const CALLS: [(&str, Scope); 15] = [
+const CALLS: [(&str, Scope); 17] = [
     ("CreateScene", Scope::Write),
     ("ListScenes", Scope::Read),
     ("GetScene", Scope::Read),
     ("WatchScene", Scope::Read),
     ("RefineScene", Scope::Write),
+    ("AddPhotos", Scope::Write),
+    ("RemovePhoto", Scope::Write),
     ("GetEdits", Scope::Read),
     ("SetEdits", Scope::Write),
     ("RenderView", Scope::Read),
@@ -73,6 +80,12 @@ async fn guarded(rest: &str) -> (tempfile::TempDir, TestServer) {
     (folder, stand)
 }
 
+/// A photo that is none of the scene's.
+fn another() -> Upload {
+    let options = SampleOptions { photos: 6, width: 64, height: 48, seed: 5 };
+    photos_of(&sample::upload(&options).expect("in range"), &[3])
+}
+
 /// Makes one call; the code of the refusal, or `ok`.
 async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
     let view = Ask::first();
@@ -97,6 +110,13 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
                 "SetEdits" => {
                     client.put(format!("{base}/v1/scenes/{id}/edits")).body("{\"edits\":[]}")
                 }
+                "AddPhotos" => client
+                    .post(format!("{base}/v1/scenes/{id}/photos?wait_ms=60000"))
+                    .multipart(form(&another())),
+                "RemovePhoto" => {
+                    let name = another().photos[0].name.replace('/', "%2F");
+                    client.delete(format!("{base}/v1/scenes/{id}/photos/{name}?wait_ms=60000"))
+                }
                 "RefineScene" => client.post(format!("{base}/v1/scenes/{id}/refine?refine=off")),
                 other => panic!("{other} is not a call"),
             };
@@ -111,7 +131,8 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
                 }
                 "Models" => client.models(pb::ModelsRequest {}).await.map(drop),
                 "WatchScene" => {
-                    client.watch_scene(pb::WatchSceneRequest { scene_id }).await.map(drop)
+                    let request = pb::WatchSceneRequest { scene_id, semantics: false };
+                    client.watch_scene(request).await.map(drop)
                 }
                 "Pick" => {
                     let camera = Some(camera);
@@ -122,6 +143,15 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
                 "RefineScene" => {
                     let off = pb::RefineSceneRequest { scene_id, refine: "off".to_owned() };
                     client.refine_scene(off).await.map(drop)
+                }
+                "AddPhotos" => {
+                    let messages = tokio_stream::iter(adding(&another(), id, ""));
+                    client.add_photos(messages).await.map(drop)
+                }
+                "RemovePhoto" => {
+                    let (name, wait_ms) = (another().photos[0].name.clone(), Some(60_000));
+                    let request = pb::RemovePhotoRequest { scene_id, name, wait_ms };
+                    client.remove_photo(request).await.map(drop)
                 }
                 "GetEdits" => client.get_edits(pb::GetEditsRequest { scene_id }).await.map(drop),
                 "SetEdits" => {
@@ -257,6 +287,8 @@ fn every_call_of_both_doors_has_its_scope_in_the_table() {
         "POST /v1/scenes",
         "DELETE /v1/scenes/{id}",
         "POST /v1/scenes/{id}/refine",
+        "POST /v1/scenes/{id}/photos",
+        "DELETE /v1/scenes/{id}/photos/{name}",
         "PUT /v1/scenes/{id}/edits",
         "POST /v2/models/{name}/infer",
     ];

@@ -2,12 +2,14 @@
 //! is refused.
 
 use std::{
+    pin::Pin,
     sync::{Arc, Mutex, atomic::Ordering},
     time::Duration,
 };
 
-use futures_util::{StreamExt, future::join_all};
+use futures_util::{Stream, StreamExt, future::join_all, stream};
 use segsplat::{
+    api::grpc::pb,
     error::{Error, ErrorCode, Result},
     limits::Limits,
     photos,
@@ -19,8 +21,10 @@ use segsplat::{
     },
     service::CreateScene,
 };
+use serde_json::Value;
 
 use crate::common::{
+    doors::{self, Door},
     meaning::PhotoMeaning,
     server::{
         PATIENCE, PointRenderer, TestServer, WallNetworks, first_view, panicking_upload, upload,
@@ -100,6 +104,102 @@ async fn the_scene_stays_done_while_its_semantics_run_and_watchers_see_their_sta
     let status = server.service.get(&id).await.unwrap();
     assert_eq!(status.semantics.state, SemanticsState::Ready);
     assert_eq!(status.semantics.report.unwrap().masks, [1, 1, 1]);
+}
+
+/// What a door tells of a scene and its semantics: `done`, or `STAGE FRACTION`.
+async fn told(door: &mut Door, id: &SceneId) -> Pin<Box<dyn Stream<Item = String> + Send>> {
+    match door {
+        Door::Http { base, client } => {
+            let events = client.get(format!("{base}/v1/scenes/{id}/events?semantics=true"));
+            let answer = events.send().await.unwrap();
+            Box::pin(stream::unfold((answer, String::new()), async |(mut answer, mut text)| {
+                loop {
+                    while let Some((event, rest)) = text.split_once("\n\n") {
+                        let data = event.lines().find_map(|line| line.strip_prefix("data: "));
+                        let data: Option<Value> = data.map(|v| serde_json::from_str(v).unwrap());
+                        text = rest.to_owned();
+                        // Else it keeps the connection alive.
+                        if let Some(data) = data {
+                            return Some((told_by(&data), (answer, text)));
+                        }
+                    }
+                    text += &String::from_utf8(answer.chunk().await.unwrap()?.to_vec()).unwrap();
+                }
+            }))
+        }
+        Door::Grpc { client } => {
+            let request = pb::WatchSceneRequest { scene_id: id.to_string(), semantics: true };
+            let events = client.watch_scene(request).await.unwrap().into_inner();
+            Box::pin(events.map(|event| {
+                let event = event.unwrap();
+                match event.state() {
+                    pb::SceneState::Running => format!("{} {}", event.stage, event.fraction),
+                    pb::SceneState::Done => "done".to_owned(),
+                    other => other.as_str_name().to_owned(),
+                }
+            }))
+        }
+    }
+}
+
+fn told_by(data: &Value) -> String {
+    let text = |name: &str| data[name].as_str().unwrap_or_default();
+    match text("event") {
+        "running" => {
+            format!("{} {}", text("stage"), data["fraction"].as_f64().unwrap() as f32)
+        }
+        other => other.to_owned(),
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn events_that_wait_for_semantics_tell_every_stage_of_a_question_that_comes_later() {
+    let (server, meaning) = server().await;
+    for mut door in doors::both(server.addr).await {
+        let id = scene(&server, SemanticsMode::Lazy).await.id;
+        let mut events = told(&mut door, &id).await;
+        let mut next = async || {
+            let next = tokio::time::timeout(PATIENCE, events.next()).await;
+            next.expect("something is told in time")
+        };
+        assert_eq!(next().await.as_deref(), Some("done"), "the scene, which nobody has asked");
+        meaning.hold.store(true, Ordering::Release);
+        server.service.understand(&id, Some(Duration::ZERO)).await.unwrap_err();
+        let at = Stage::Masks.overall(PhotoMeaning::HELD_AT);
+        let masks = format!("masks {at}");
+        let mut told = next().await.expect("the question follows");
+        while told != masks {
+            assert!(told.starts_with("masks "), "{told}");
+            told = next().await.expect("it is held");
+        }
+        meaning.hold.store(false, Ordering::Release);
+        let mut rest = Vec::new();
+        while let Some(told) = next().await {
+            rest.push(told);
+        }
+        assert_eq!(rest.pop().as_deref(), Some("done"), "the semantics: {rest:?}");
+        assert!(rest.iter().all(|told| told.starts_with("assign ")), "{rest:?}");
+        assert_eq!(told_of(&mut door, &id).await, ["done"], "they are there");
+        // Else the next scene of these photos is a copy of it.
+        server.service.delete(&id).await.unwrap();
+    }
+    let off = scene(&server, SemanticsMode::Off).await.id;
+    let [mut http, _] = doors::both(server.addr).await;
+    assert_eq!(told_of(&mut http, &off).await, ["done"], "it will never have any");
+    server.service.delete(&off).await.unwrap();
+    // Those that fail are the end, too.
+    *meaning.fails.lock().unwrap() = Some(ErrorCode::Internal);
+    let id = scene(&server, SemanticsMode::Lazy).await.id;
+    let mut events = told(&mut http, &id).await;
+    assert_eq!(events.next().await.as_deref(), Some("done"));
+    server.service.understand(&id, Some(PATIENCE)).await.unwrap_err();
+    let all = tokio::time::timeout(PATIENCE, events.collect::<Vec<_>>()).await.unwrap();
+    assert_eq!(all.last().map(String::as_str), Some("done"), "{all:?}");
+}
+
+async fn told_of(door: &mut Door, id: &SceneId) -> Vec<String> {
+    let events = told(door, id).await;
+    tokio::time::timeout(PATIENCE, events.collect()).await.expect("it ends")
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -277,6 +277,21 @@ fn bench_says_the_time_of_a_view_and_its_error() {
     assert_eq!(told["renderer"], "cpu");
 }
 
+/// Makes a bundle of the stand-in `plane` and the feature network of the product.
+fn with_features(folder: &Path) {
+    let root = crate::common::root();
+    let at = |bundle: &str| root.join(bundle);
+    let (plane, product) = (at("tests/fixtures/plane"), at("models/embedded"));
+    let manifest = |of: &Path| std::fs::read_to_string(of.join("bundle.toml")).unwrap();
+    let all = manifest(&product);
+    let features = &all[all.find("[features]").expect("the product has them")..];
+    std::fs::create_dir(folder).unwrap();
+    std::fs::write(folder.join("bundle.toml"), manifest(&plane) + "\n" + features).unwrap();
+    for (from, file) in [(&plane, "plane.onnx"), (&product, "features.onnx")] {
+        std::fs::copy(from.join(file), folder.join(file)).unwrap();
+    }
+}
+
 #[test]
 fn photos_without_cameras_get_them_and_a_file_of_them() {
     if !with_network() {
@@ -284,24 +299,32 @@ fn photos_without_cameras_get_them_and_a_file_of_them() {
     }
     let folder = tempfile::tempdir().unwrap();
     let photos = folder.path().join("only photos");
-    ok(&["sample", "-o", text(&photos), "--photos", "8", "--size", "480x360"]);
+    std::fs::create_dir_all(photos.join("images")).unwrap();
+    for name in ["0001.jpg", "0002.jpg", "0003.jpg", "0004.jpg"] {
+        let from = crate::common::root().join("tests/fixtures/room/images").join(name);
+        std::fs::copy(from, photos.join("images").join(name)).unwrap();
+    }
     let file = photos.join("transforms.json");
-    std::fs::remove_file(&file).unwrap();
-    let told = ok_json(&["cameras", text(&photos), "-o", text(&file)]);
-    assert_eq!(told["cameras"]["placed"].as_array().unwrap().len(), 8, "{told}");
+    let bundle = folder.path().join("bundle");
+    with_features(&bundle);
+    let bundle = ["--bundle", text(&bundle)];
+    let line = ["cameras", text(&photos), "-o", text(&file)];
+    let told = ok_json(&[&line[..], &bundle].concat());
+    assert_eq!(told["cameras"]["placed"].as_array().unwrap().len(), 4, "{told}");
     let written: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     let frames = written["frames"].as_array().unwrap();
-    assert_eq!(frames.len(), 8);
+    assert_eq!(frames.len(), 4);
     assert_eq!(
         (&frames[0]["w"], &frames[0]["file_path"]),
-        (&json!(480), &json!("images/0000.png"))
+        (&json!(320), &json!("images/0001.jpg"))
     );
     // The file is read as any other, and the photos alone give the same cameras.
     let scene = folder.path().join("x.segsplat");
-    let given = ok_json(&["reconstruct", text(&photos), "-o", text(&scene)]);
+    let line = [&["reconstruct", text(&photos), "-o", text(&scene)][..], &bundle].concat();
+    let given = ok_json(&line);
     assert_eq!(given["report"]["cameras"]["source"], "given");
     std::fs::remove_file(&file).unwrap();
-    let solved = ok_json(&["reconstruct", text(&photos), "-o", text(&scene)]);
+    let solved = ok_json(&line);
     assert_eq!(solved["report"]["cameras"]["source"], "solved");
     let poses = |of: &Value| -> Vec<f64> {
         let cameras = of["cameras"].as_array().unwrap().iter();
@@ -312,7 +335,6 @@ fn photos_without_cameras_get_them_and_a_file_of_them() {
     assert!(apart.fold(0.0, f64::max) < 1e-9, "{given}\n{solved}");
     // Too few of them.
     std::fs::remove_dir_all(photos.join("images")).unwrap();
-    let line = ["reconstruct", text(&photos), "-o", text(&scene)];
     refused(&line, ErrorCode::InvalidRequest, "no photos and no cameras");
 }
 
@@ -375,10 +397,12 @@ fn a_scene_is_refined_for_as_long_as_asked() {
     }
     let folder = tempfile::tempdir().unwrap();
     let (photos, scene) = (folder.path().join("photos"), folder.path().join("made.segsplat"));
-    ok(&["sample", "-o", text(&photos), "--photos", "6", "--size", "256x256"]);
+    ok(&["sample", "-o", text(&photos), "--photos", "6", "--size", "120x80"]);
     let line = ["reconstruct", text(&photos), "-o", text(&scene), "--refine"];
     refused(&[&line[..], &["0"]].concat(), ErrorCode::InvalidRequest, "refine is 0 ms");
-    let made = ok_json(&[&line[..], &["8000", "--semantics", "eager"], &CPU].concat());
+    // Networks that know nothing of rooms: a few steps make their scene better.
+    let rest = ["2000", "--semantics", "eager", "--bundle", "tests/fixtures/colours"];
+    let made = ok_json(&[&line[..], &rest, &CPU].concat());
     let found = &made["report"]["refinement"];
     let [before, after] = ["psnr_before", "psnr_after"].map(|name| found[name].as_f64().unwrap());
     assert!(found["steps"].as_u64() > Some(0) && after > before, "{found}");
@@ -497,7 +521,7 @@ fn bundle_and_library_are_found_from_any_folder() {
             std::fs::write(at("Cargo.toml"), "").unwrap();
         }
         std::fs::copy(env!("CARGO_BIN_EXE_segsplat"), at(program)).unwrap();
-        symlink(crate::common::root().join("models/embedded"), at(bundle)).unwrap();
+        symlink(crate::common::root().join("tests/fixtures/plane"), at(bundle)).unwrap();
         symlink(runtime.path(), at(library)).unwrap();
         let mut verify = Command::new(folder.path().join(program));
         verify.current_dir(elsewhere.path()).env_clear().args(["models", "verify", "--json"]);
@@ -537,6 +561,7 @@ fn serve_says_where_it_listens_and_ends_at_sigterm() {
             .current_dir(crate::common::root())
             .args(["serve", "--listen", "127.0.0.1:0", "--json", "--data-dir"])
             .args([text(folder.path()), "--renderer", "cpu"])
+            .args(["--bundle", "tests/fixtures/plane"])
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
             .spawn()
@@ -556,6 +581,7 @@ fn serve_says_where_it_listens_and_ends_at_sigterm() {
     assert!(ready.status().is_success(), "{}", ready.status());
     let data = text(folder.path());
     let line = ["serve", "--listen", "127.0.0.1:0", "--data-dir", data, CPU[0], CPU[1]];
+    let line = [&line[..], &["--bundle", "tests/fixtures/plane"]].concat();
     let used = format!("another process uses the data folder {data}");
     refused(&line, ErrorCode::StoreUnavailable, &used);
     assert!(signal(child.0.id(), "TERM"));

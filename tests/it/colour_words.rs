@@ -205,6 +205,25 @@ async fn a_word_is_found_in_the_photos_by_a_network_that_masks_texts() {
     let ply = get("export?format=ply&text=red").await;
     let head = String::from_utf8_lossy(&ply[..200]).into_owned();
     assert!(head.contains(&format!("element vertex {}\n", words[0])), "{head}");
+    // An edit takes what the query shows, also of what an edit before it has copied, or a part.
+    let put = async |edits: Value| {
+        let put = client.put(at("edits")).json(&json!({ "edits": edits }));
+        body(put.send().await.unwrap()).await.unwrap()["counts"].clone()
+    };
+    let red_of = |op: &str, more: Value| {
+        let mut edit = json!({ "op": op, "select": { "text": "red" } });
+        edit.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
+        edit
+    };
+    let copy = red_of("copy", json!({ "translation": [0.0, 9.0, 0.0] }));
+    let taken = put(json!([copy, red_of("delete", json!({}))])).await;
+    assert_eq!(taken, json!([words[0], 2 * words[0]]));
+    let part = json!({ "select": { "text": "red", "parts": [0] } });
+    let counts = put(json!([red_of("delete", part)])).await;
+    let [taken, of_part] =
+        [&counts[0], &red["parts"][0]["gaussians"]].map(|count| count.as_u64().unwrap());
+    assert!((of_part..=words[0]).contains(&taken), "{counts}");
+    put(json!([])).await;
     // Without photos the towers answer, by the semantics of the file.
     let part = reqwest::multipart::Part::bytes(ply).file_name("red.ply");
     let form = reqwest::multipart::Form::new().part("splats", part);

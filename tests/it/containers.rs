@@ -300,7 +300,9 @@ fn a_software_adapter_in_the_place_of_the_driver_is_refused() {
     let icd = root().join("docker/nvidia/vulkan.json");
     for (libraries, seen) in [(found, "none"), (beside, "\"llvmpipe")] {
         let ended = Command::new(env!("CARGO_BIN_EXE_segsplat"))
-            .args(["serve", "--listen", "127.0.0.1:0", "--renderer", "gpu", "--data-dir"])
+            .args(["serve", "--listen", "127.0.0.1:0", "--renderer", "gpu", "--bundle"])
+            .arg(root().join("tests/fixtures/plane"))
+            .arg("--data-dir")
             .arg(folder.path().join("data"))
             .env("LD_LIBRARY_PATH", libraries)
             .envs([("VK_DRIVER_FILES", &icd), ("VK_ICD_FILENAMES", &icd)])

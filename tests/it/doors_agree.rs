@@ -16,7 +16,8 @@ use crate::common::{cpu_server::CpuServer, root};
 type Absent = &'static [(&'static str, &'static str)];
 
 /// Calls on the command line, and its commands.
-const COMMANDS: [(&str, &str); 7] = [
+const COMMANDS: [(&str, &str); 8] = [
+    ("add_photos", "add"),
     ("create_scene", "reconstruct"),
     ("render_view", "render"),
     ("query", "query"),
@@ -32,6 +33,10 @@ const NOT_IN_GRPC: Absent = &[
     ("create_scene.cameras", "`cameras_json`, and `cameras_mode`"),
     ("create_scene.masks", "a `photo` of the name `masks/PHOTO.png`"),
     ("create_scene.transforms", "`transforms_json`"),
+    ("add_photos.cameras", "`cameras_json`"),
+    ("add_photos.transforms", "`transforms_json`"),
+    ("add_photos.masks", "a `photo` of the name `masks/PHOTO.png`"),
+    ("add_photos.splats", "a file of Gaussians is a scene of its own"),
     ("pick.label", "`labels`"),
     ("set_edits.edits", "`edits_json`"),
     ("render_views.container", "a stream of views"),
@@ -45,6 +50,8 @@ const NOT_ON_THE_COMMAND_LINE: Absent = &[
     ("get_scene", "`inspect` shows a file"),
     ("delete_scene", "it works on files"),
     ("watch_scene", "`reconstruct` shows its progress"),
+    ("add_photos.*", "the arguments"),
+    ("remove_photo", "files keep no photos; `curl -X DELETE`"),
     ("get_edits", "a file has no list: `edit` writes what it comes to"),
     ("refine_scene", "`reconstruct --refine`: a file has no photos"),
     ("render_views", "a call of `render` for each camera"),
@@ -69,6 +76,9 @@ const NOT_ON_THE_PAGE: Absent = &[
     ("get_edits", "the list of edits comes with the page that is being made anew"),
     ("set_edits", "the list of edits comes with the page that is being made anew"),
     ("refine_scene", "it takes the machine for minutes: an operator or a program asks for it"),
+    ("add_photos", "photos join from a program, as a robot takes them"),
+    ("remove_photo", "photos leave by a program"),
+    ("Scene.growth", "photos join and leave by a program"),
     ("render_view.*", "a small picture of what a photo shows, as the server draws it"),
     ("render_views", "the page draws the scene itself"),
     ("features", "arrays are for programs"),

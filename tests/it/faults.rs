@@ -3,6 +3,7 @@
 
 use std::{
     collections::{BTreeMap, HashSet},
+    ops::Range,
     path::Path,
     sync::{Arc, atomic::Ordering},
     time::{Duration, Instant},
@@ -100,8 +101,18 @@ fn kept(data: &Path) -> HashSet<String> {
     ids
 }
 
+/// Stores that are called beside each other in the test below: most of their time is waiting.
+const STORES: u64 = 4;
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_store_that_fails_tears_and_stalls_loses_nothing_it_acknowledged() {
+    let steps = if long() { 3_000 } else { 120 } / STORES;
+    let stores = (0..STORES).map(|i| a_bad_store(i * steps..(i + 1) * steps));
+    futures_util::future::join_all(stores).await;
+}
+
+/// So many calls of a server to a store that fails, each with faults of its own.
+async fn a_bad_store(steps: Range<u64>) {
     let folder = tempfile::tempdir().unwrap();
     let local = LocalFileSystem::new_with_prefix(folder.path()).unwrap();
     let local: Arc<dyn ObjectStore> = Arc::new(local.with_automatic_cleanup(true));
@@ -113,12 +124,12 @@ async fn a_store_that_fails_tears_and_stalls_loses_nothing_it_acknowledged() {
     })
     .await;
 
-    let mut random = Random(5);
+    let mut random = Random(5 + steps.start);
     let mut whole: BTreeMap<SceneId, Vec<u8>> = BTreeMap::new();
     let (mut gone, mut doomed) = (HashSet::new(), HashSet::new());
-    let (steps, mut refused) = (if long() { 3_000 } else { 120 }, 0);
-    for step in 0..steps {
-        let mut dice = Random(step as u64);
+    let mut refused = 0;
+    for step in steps.clone() {
+        let mut dice = Random(step);
         faults.plan(move |what, _| match (dice.below(100), what) {
             (0..=5, _) => Some(Wrong::Fails),
             (6..=8, _) => Some(Wrong::Lost),
@@ -128,8 +139,7 @@ async fn a_store_that_fails_tears_and_stalls_loses_nothing_it_acknowledged() {
         });
         let ids: Vec<SceneId> = whole.keys().cloned().collect();
         match (random.below(10), ids.get(random.below(ids.len().max(1)))) {
-            (0..=4, _) | (_, None) => match server.service.create_scene(request(step as u64)).await
-            {
+            (0..=4, _) | (_, None) => match server.service.create_scene(request(step)).await {
                 Ok(created) if created.status.state == SceneState::Done => {
                     let id = created.status.id;
                     faults.plan(|_, _| None);
@@ -161,7 +171,7 @@ async fn a_store_that_fails_tears_and_stalls_loses_nothing_it_acknowledged() {
                 }
             }
         }
-        if step % 40 == 39 {
+        if step % 20 == 19 {
             faults.plan(|_, _| None);
             server = server.restart().await;
         }
@@ -175,7 +185,8 @@ async fn a_store_that_fails_tears_and_stalls_loses_nothing_it_acknowledged() {
         assert!(now.as_ref() == Ok(file), "{id} is lost or changed: {:?}", now.map(|f| f.len()));
     }
     for id in &gone {
-        assert_eq!(found(&server.service, id).await, Err(ErrorCode::SceneNotFound), "{id}");
+        let now = found(&server.service, id).await.map(|file| file.len());
+        assert_eq!(now, Err(ErrorCode::SceneNotFound), "{id}");
     }
     let there = listed(&server.service).await;
     let there: HashSet<String> = there.iter().map(SceneId::to_string).collect();
@@ -186,8 +197,9 @@ async fn a_store_that_fails_tears_and_stalls_loses_nothing_it_acknowledged() {
     let left: Vec<String> = kept(folder.path()).difference(&there).cloned().collect();
     assert_eq!(left, [""; 0], "left over after a sweep");
     println!(
-        "{steps} calls, {} faults: {refused} creates refused, {} scenes whole, {} gone, {} whose \
+        "{} calls, {} faults: {refused} creates refused, {} scenes whole, {} gone, {} whose \
          deletion failed",
+        steps.end - steps.start,
         faults.wrongs.load(Ordering::Relaxed),
         whole.len(),
         gone.len(),
@@ -378,7 +390,11 @@ async fn a_scene_that_was_taken_waits_while_the_disk_is_full_and_is_made_after()
     })
     .await;
     // It is tried again and again, and none of that counts as an attempt.
-    tokio::time::sleep(Duration::from_secs(5)).await;
+    let before = faults.wrongs.load(Ordering::Relaxed);
+    eventually("it is tried again", async || {
+        (faults.wrongs.load(Ordering::Relaxed) > before + 2).then_some(())
+    })
+    .await;
     let status = server.service.get(&id).await.unwrap();
     assert_eq!((status.state, ready().await), (SceneState::Queued, false), "{status:?}");
     faults.plan(|_, _| None);
@@ -429,6 +445,35 @@ async fn a_deletion_counts_where_the_job_removed_its_own_record_first() {
     assert_eq!(listed(&server.service).await, HashSet::new(), "no ghost is listed");
     let again = server.service.delete(&id).await.unwrap_err();
     assert_eq!(again.code(), ErrorCode::SceneNotFound);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_deleted_does_not_come_back_by_a_call_that_was_given_up() {
+    let folder = tempfile::tempdir().unwrap();
+    let local = LocalFileSystem::new_with_prefix(folder.path()).unwrap();
+    let local: Arc<dyn ObjectStore> = Arc::new(local.with_automatic_cleanup(true));
+    let stall = Duration::from_secs(1);
+    let faults = Arc::new(FaultStore::new(local, stall));
+    let place = StoreLocation::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
+    let server = TestServer::at(&place, |config, _| config.limits.store_timeout_ms = 200).await;
+    let id = server.service.create_scene(request(1)).await.unwrap().status.id;
+    let status = format!("scenes/{id}/status.json");
+    let mut stalls = true;
+    faults.plan(move |what, path| {
+        let is_first = what == "put" && path.as_ref() == status && std::mem::take(&mut stalls);
+        is_first.then_some(Wrong::Stalls)
+    });
+    let given_up = server.service.refine(&id, Refine::Ms(600_000)).await.unwrap_err();
+    assert_eq!(given_up.code(), ErrorCode::StoreUnavailable, "{given_up}");
+    let deleted = server.service.delete(&id).await;
+    // What was late has come.
+    tokio::time::sleep(stall).await;
+    if deleted.is_err() {
+        server.service.delete(&id).await.expect("nothing is late any more");
+    }
+    let server = server.restart().await;
+    let after = server.service.get(&id).await.map(|status| status.state);
+    assert_eq!(after.map_err(|error| error.code()), Err(ErrorCode::SceneNotFound));
 }
 
 #[tokio::test(flavor = "multi_thread")]

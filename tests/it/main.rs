@@ -25,6 +25,7 @@ mod faults;
 mod fields;
 mod folders;
 mod formats;
+mod growing;
 mod grpc;
 mod hostile;
 mod http;

@@ -15,7 +15,9 @@ use segsplat::{
     config::Config,
     error::{ErrorCode, Result},
     pipeline::{
-        Pipeline, reconstruct,
+        Pipeline,
+        masks::{GiveMasks, MasksOfPhotos},
+        reconstruct,
         semantics::{Context, SemanticsInput, SemanticsTools, understand, understand_with},
     },
     sample::{self, SampleOptions},
@@ -111,8 +113,13 @@ fn colour_of(crops: &Vec<Crop>) -> Result<Vec<f32>> {
     Ok(crops.iter().flat_map(mean).collect())
 }
 
-type Masks<'a> = &'a (dyn Fn(&(dyn Fn(f32) + Sync)) -> Result<Vec<PhotoMasks>> + Sync);
+type Masks<'a> = &'a MasksOfPhotos<'a>;
 type Embed<'a> = &'a (dyn Fn(&Vec<Crop>) -> Result<Vec<f32>> + Sync);
+
+/// Gives the masks of each photo, the last photo first.
+fn each(give: &GiveMasks<'_>, masks: Vec<PhotoMasks>) -> Result<()> {
+    masks.into_iter().enumerate().rev().try_for_each(|(photo, masks)| give(photo, masks))
+}
 
 type Tools<'a> = SemanticsTools<'a, Vec<Crop>>;
 
@@ -138,10 +145,7 @@ fn made(wall: &Wall, tools: &Tools<'_>, options: &Method) -> Result<Semantics> {
 fn each_gaussian_takes_the_bank_row_of_its_pixel() {
     let wall = wall();
     let told = Mutex::new(Vec::new());
-    let masks: Masks<'_> = &|progress| {
-        progress(0.5);
-        Ok((0..2).map(two_masks).collect())
-    };
+    let masks: Masks<'_> = &|give| each(give, (0..2).map(two_masks).collect());
     let watch = Watch {
         progress: &|stage: Stage, fraction| {
             told.lock().unwrap().push((stage.name(), fraction));
@@ -176,7 +180,7 @@ fn each_gaussian_takes_the_bank_row_of_its_pixel() {
 #[test]
 fn masks_of_several_photos_fill_a_batch() {
     let wall = wall();
-    let masks: Masks<'_> = &|_| Ok((0..2).map(two_masks).collect());
+    let masks: Masks<'_> = &|give| each(give, (0..2).map(two_masks).collect());
     let batches = Mutex::new(Vec::new());
     let embed: Embed<'_> = &|crops| {
         batches.lock().unwrap().push(crops.len());
@@ -187,13 +191,32 @@ fn masks_of_several_photos_fill_a_batch() {
 }
 
 #[test]
+fn masks_of_a_photo_are_embedded_while_those_of_the_next_are_found() {
+    let wall = wall();
+    let (begun, begins) = mpsc::channel();
+    let begins = Mutex::new(begins);
+    let masks: Masks<'_> = &|give| {
+        give(0, two_masks(0))?;
+        let told = begins.lock().unwrap().recv_timeout(Duration::from_secs(60));
+        told.expect("the first photo's masks are embedded meanwhile");
+        give(1, two_masks(1))
+    };
+    let embed: Embed<'_> = &|crops| {
+        begun.send(()).expect("the test listens");
+        colour_of(crops)
+    };
+    let made = made(&wall, &Tools { batch: 2, ..tools(masks, embed) }, &Method::default());
+    assert_eq!(made.unwrap().report.masks, [2, 2]);
+}
+
+#[test]
 fn the_place_in_the_whole_photo_is_added_to_each_crop() {
     let wall = wall();
-    let masks: Masks<'_> = &|_| {
+    let masks: Masks<'_> = &|give| {
         let mut masks = vec![two_masks(0), PhotoMasks::default()];
         masks[0].masks[0].area = 0.5;
         masks[0].masks[1].area = 0.001;
-        Ok(masks)
+        each(give, masks)
     };
     let asked = Mutex::new(Vec::new());
     // Blue everywhere.
@@ -214,11 +237,11 @@ fn the_place_in_the_whole_photo_is_added_to_each_crop() {
     assert_eq!(*asked.lock().unwrap(), [32], "a photo without masks is not looked at");
     let told = told.into_inner().unwrap();
     let embed = told.iter().filter(|(stage, _)| *stage == Stage::Embed).map(|(_, share)| *share);
-    assert_eq!(
-        embed.collect::<Vec<f32>>(),
-        [0.0, 0.0, 2.0 / 7.0, 1.0],
-        "begin, crops, the photo, end"
-    );
+    let embed: Vec<f32> = embed.collect();
+    assert!(embed.is_sorted() && embed.first() == Some(&0.0), "{embed:?}");
+    assert_eq!(embed.last(), Some(&1.0), "{embed:?}");
+    // Crops and photos that were done before all masks were there are not told.
+    assert!(embed.iter().all(|share| [0.0, 5.0 / 7.0, 1.0].contains(share)), "{embed:?}");
     let rows = [0, 15].map(|i| whole.bank.row(usize::from(whole.index[i]) - 1));
     let half = 0.5_f32.sqrt();
     assert!([0, 2].iter().all(|i| (rows[0][*i] - half).abs() < 0.03), "{rows:?}");
@@ -232,7 +255,7 @@ fn the_place_in_the_whole_photo_is_added_to_each_crop() {
 #[test]
 fn a_photo_without_masks_and_a_scene_without_any_are_legal() {
     let wall = wall();
-    let one: Masks<'_> = &|_| Ok(vec![two_masks(0), PhotoMasks::default()]);
+    let one: Masks<'_> = &|give| each(give, vec![two_masks(0), PhotoMasks::default()]);
     let options = Method { votes: true, ..Method::default() };
     let half = made(&wall, &tools(one, &colour_of), &options).unwrap();
     assert_eq!(half.report.masks, [2, 0]);
@@ -242,7 +265,7 @@ fn a_photo_without_masks_and_a_scene_without_any_are_legal() {
     assert!(plain.index[256..].iter().all(|m| *m == 0), "photo 1 has none");
     let filled = half.index[256..].iter().filter(|m| **m > 0).count();
     assert!(filled > 200, "photo 0 votes for what photo 1 also shows: {filled}");
-    let none: Masks<'_> = &|_| Ok(vec![PhotoMasks::default(); 2]);
+    let none: Masks<'_> = &|give| each(give, vec![PhotoMasks::default(); 2]);
     let empty = made(&wall, &tools(none, &colour_of), &options).unwrap();
     assert_eq!((empty.bank.len(), empty.bank.dim, empty.report.labelled), (0, 3, 0));
     assert_eq!(empty.index, vec![0; 512]);
@@ -251,10 +274,10 @@ fn a_photo_without_masks_and_a_scene_without_any_are_legal() {
 #[test]
 fn masks_that_mean_nothing_stay_background() {
     let wall = wall();
-    let masks: Masks<'_> = &|_| {
+    let masks: Masks<'_> = &|give| {
         let mut masks: Vec<PhotoMasks> = (0..2).map(two_masks).collect();
         masks[0].masks.push(MaskInfo::default());
-        Ok(masks)
+        each(give, masks)
     };
     // Green crops get no embedding.
     let embed: Embed<'_> = &|crops| {
@@ -276,7 +299,7 @@ fn two_sides_of_one_thing_are_joined_only_when_asked() {
         map: IndexMap { width: 1, height: 1, index: vec![1] },
         masks: vec![MaskInfo::default()],
     };
-    let masks: Masks<'_> = &|_| Ok(vec![whole(), whole()]);
+    let masks: Masks<'_> = &|give| each(give, vec![whole(), whole()]);
     let embed: Embed<'_> = &|crops| {
         assert_eq!(crops.len(), 2);
         Ok(vec![1.0, 0.0, 0.0, 0.6, 0.8, 0.0])
@@ -298,10 +321,10 @@ fn two_sides_of_one_thing_are_joined_only_when_asked() {
 fn masks_of_one_thing_are_a_row_whatever_each_looks_like() {
     let wall = wall();
     // The larger mask of each photo is the second one.
-    let masks: Masks<'_> = &|_| {
+    let masks: Masks<'_> = &|give| {
         let mut masks: Vec<PhotoMasks> = (0..2).map(two_masks).collect();
         masks.iter_mut().for_each(|of| of.masks[1].area = 0.5);
-        Ok(masks)
+        each(give, masks)
     };
     let looks = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]];
     let embedded = Mutex::new(looks.iter());
@@ -329,9 +352,9 @@ fn masks_of_one_thing_are_a_row_whatever_each_looks_like() {
 #[test]
 fn wrong_answers_and_wrong_scenes_are_refused_by_name() {
     let good = wall();
-    let masks: Masks<'_> = &|_| Ok((0..2).map(two_masks).collect());
+    let masks: Masks<'_> = &|give| each(give, (0..2).map(two_masks).collect());
     let fails = |wall: &Wall, tools: &Tools<'_>| made(wall, tools, &Method::default()).unwrap_err();
-    let few: Masks<'_> = &|_| Ok(vec![two_masks(0)]);
+    let few: Masks<'_> = &|give| each(give, vec![two_masks(0)]);
     let error = fails(&good, &tools(few, &colour_of));
     assert!(error.message().contains("masks of 1 photos, not of 2"), "{error}");
     let error = fails(&good, &tools(masks, &|_| Ok(vec![1.0])));

@@ -120,9 +120,12 @@ def test_the_first_word_shows_how_far_it_is(page: Page, url: str, photos: Path) 
           const says = document.getElementById('says');
           new MutationObserver(() => said.push(says.textContent)).observe(
             says, { childList: true, characterData: true, subtree: true }); }""")
+    watched = []
+    page.on("request", lambda request: "/events" in request.url and watched.append(request.url))
     page.fill("#text", "box")
     page.press("#text", "Enter")
     expect(page.locator("#words li strong")).to_have_text(["box"])
+    assert [url.split("?")[-1] for url in watched] == ["semantics=true"], "one stream tells all"
     said = page.evaluate("said")
     assert any(text.startswith("finding things: ") for text in said), said
     expect(page.locator("#progress")).to_be_hidden()

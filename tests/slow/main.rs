@@ -13,6 +13,7 @@ mod cameras;
 mod common;
 mod conventions;
 mod fuzz_input;
+mod grow_kill;
 mod kill;
 mod load;
 mod refine_kill;

@@ -6,16 +6,19 @@ import io
 import json
 import shutil
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
+from served import run
 
 from segsplat import (
     Cancelled,
     Client,
     Event,
+    Growth,
     InvalidRequest,
     Refinement,
     Scene,
@@ -33,6 +36,21 @@ def test_a_scene_tells_how_it_was_made(scene: Scene, client: Client) -> None:
     assert [photo.file for photo in scene.photos] == ["images/0000.png", "images/0001.png"]
     assert client.get(scene.id).report is not None
     assert f"{report.gaussians} Gaussians" in repr(scene)
+
+
+def test_events_go_on_until_the_first_text_is_answered(client: Client, photos: Path) -> None:
+    scene = client.scene(photos, density="full", progress=False)
+    events = scene.events(semantics=True)
+    assert next(events) == Event("done"), "the scene, which nobody has asked"
+    with ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(scene.query, "box")
+        *told, last = events
+        assert asked.result()[0].found
+    assert last == Event("done") and list(scene.events(semantics=True)) == [last]
+    assert "masks" in [event.stage for event in told]
+    fractions = [event.fraction for event in told]
+    assert fractions == sorted(fractions)
+    scene.delete()
 
 
 def test_events_end_with_the_last(client: Client, photos: Path) -> None:
@@ -222,6 +240,32 @@ def test_a_scene_is_refined_while_it_is_served(client: Client, photos: Path) -> 
     assert client.get(scene.id).status.refinement.state in ("none", "done")
     with pytest.raises(InvalidRequest, match="refine is 0 ms"):
         scene.refine(0)
+    scene.delete()
+
+
+def test_photos_join_a_scene_and_leave_it(client: Client, tmp_path: Path) -> None:
+    run("sample", "--photos", "5", "-o", tmp_path / "all")
+    described = json.loads((tmp_path / "all" / "transforms.json").read_bytes())
+    frames = described["frames"]
+
+    def some(name: str, which: list[int]) -> Path:
+        folder = tmp_path / name
+        shutil.copytree(tmp_path / "all" / "images", folder / "images")
+        told = {**described, "frames": [frames[i] for i in which]}
+        (folder / "transforms.json").write_text(json.dumps(told))
+        return folder
+
+    scene = client.scene(some("first", [0, 1, 2]), refine="off")
+    assert scene.status.growth == Growth()
+    scene.add(some("more", [3, 4]))
+    assert scene.status.growth.state == "done" and scene.status.version == 2
+    assert len(scene.photos) == 5 and scene.view(from_=4, width=32).image.any()
+    with pytest.raises(InvalidRequest, match="already"):
+        scene.add(some("again", [4]))
+    scene.remove(scene.photos[0])
+    assert len(scene.photos) == 4 and scene.status.version == 3
+    with pytest.raises(SegSplatError, match="no photo"):
+        scene.remove("images/0000.png")
     scene.delete()
 
 

@@ -60,38 +60,12 @@ pub fn mend(
     }
     let pixels: Vec<Vec<Vector2<f64>>> = cameras.iter().zip(photos).map(plain_pixels).collect();
     let given: Vec<Pose> = cameras.iter().map(|camera| pose_of(&camera.camera_to_world)).collect();
-    let near = matches.iter().flat_map(|of| {
-        let [a, b] = of.photos;
-        let between = between(&given[a], &given[b]);
-        let (of_a, of_b) = (&pixels[a], &pixels[b]);
-        let near: Vec<[(u32, u32); 2]> = of
-            .pairs
-            .iter()
-            .filter(|[i, j]| off_line(&between, &of_a[*i as usize], &of_b[*j as usize]) < LINE_MAX)
-            .map(|[i, j]| [(a as u32, *i), (b as u32, *j)])
-            .collect();
-        let least = NEAR_SHARE * of.pairs.len() as f64;
-        let speaks = near.len() >= NEAR_MIN && near.len() as f64 >= least;
-        if speaks { near } else { Vec::new() }
-    });
-    let counts: Vec<usize> = photos.iter().map(|photo| photo.keypoints.len()).collect();
-    let tracks: Vec<Vec<Sight>> = join(&counts, near)
-        .into_iter()
-        .map(|track| {
-            let sight = |(camera, keypoint): (u32, u32)| {
-                let camera = camera as usize;
-                Sight { camera, pixel: pixels[camera][keypoint as usize] }
-            };
-            track.into_iter().map(sight).collect()
-        })
-        .collect();
+    let tracks = tracks(&given, &pixels, matches);
     let mut poses = given.clone();
-    let (mut held, mut loose) = (vec![false; poses.len()], vec![false; poses.len()]);
+    let (mut held, mut loose) = (Vec::new(), vec![false; poses.len()]);
     for scale_px in SCALES {
         let mut bundle = bundle(&poses, &tracks, scale_px);
-        let mut sights = vec![0; poses.len()];
-        bundle.sights.iter().flatten().for_each(|sight| sights[sight.camera] += 1);
-        held = (0..poses.len()).map(|i| sights[i] >= SIGHTS_MIN && !loose[i]).collect();
+        held = held_by(&bundle, &loose);
         for of_point in &mut bundle.sights {
             of_point.retain(|sight| held[sight.camera]);
         }
@@ -109,6 +83,42 @@ pub fn mend(
     }
     Ok((held.iter().filter(|held| **held).count() >= 2)
         .then(|| poses.iter().map(camera_to_world).collect()))
+}
+
+/// The tracks of the matches that are near the lines of the given cameras.
+fn tracks(
+    given: &[Pose],
+    pixels: &[Vec<Vector2<f64>>],
+    matches: &[PairMatches],
+) -> Vec<Vec<Sight>> {
+    let near = matches.iter().flat_map(|of| {
+        let [a, b] = of.photos;
+        let between = between(&given[a], &given[b]);
+        let (of_a, of_b) = (&pixels[a], &pixels[b]);
+        let near: Vec<[(u32, u32); 2]> = of
+            .pairs
+            .iter()
+            .filter(|[i, j]| off_line(&between, &of_a[*i as usize], &of_b[*j as usize]) < LINE_MAX)
+            .map(|[i, j]| [(a as u32, *i), (b as u32, *j)])
+            .collect();
+        let least = NEAR_SHARE * of.pairs.len() as f64;
+        let speaks = near.len() >= NEAR_MIN && near.len() as f64 >= least;
+        if speaks { near } else { Vec::new() }
+    });
+    let counts: Vec<usize> = pixels.iter().map(Vec::len).collect();
+    let sight = |(camera, keypoint): (u32, u32)| {
+        let camera = camera as usize;
+        Sight { camera, pixel: pixels[camera][keypoint as usize] }
+    };
+    let tracks = join(&counts, near).into_iter();
+    tracks.map(|track| track.into_iter().map(sight).collect()).collect()
+}
+
+/// Which cameras enough keypoints hold, but for those that are `loose`.
+fn held_by(bundle: &Bundle, loose: &[bool]) -> Vec<bool> {
+    let mut sights = vec![0; loose.len()];
+    bundle.sights.iter().flatten().for_each(|sight| sights[sight.camera] += 1);
+    sights.iter().zip(loose).map(|(&sights, loose)| sights >= SIGHTS_MIN && !loose).collect()
 }
 
 /// Keypoints as [`FOCAL`] sees them, from the middle.

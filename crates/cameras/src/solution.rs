@@ -1,6 +1,7 @@
 //! What callers get: cameras, points, confidence.
 
 use segsplat_core::scene::Camera;
+use serde::Serialize;
 
 /// A photo whose camera was found.
 #[derive(Clone, Copy, Debug)]
@@ -58,7 +59,7 @@ pub struct Solution {
 pub const CONFIDENCE_MIN: f64 = 0.5;
 
 /// What speaks for a solution and against it.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Evidence {
     /// Pairs of placed photos whose matches fit one geometry of two views.
     pub links: usize,

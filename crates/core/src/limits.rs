@@ -166,6 +166,7 @@ limits! {
     /// Bytes of edited scenes kept in memory, beside `cache_bytes_max` for those without edits.
     edited_cache_bytes_max: u64 = 2 << 30, restart;
     /// Bytes of scenes kept on one GPU device: what a card of 8 GB has to spare beside its frames.
+    /// A larger scene stays in host memory; of it the device has what its last views showed.
     device_scene_bytes_max: u64 = 2 << 30, restart;
     /// Milliseconds in which the head of a request must come, from the connection's start or the
     /// end of the call before it. A connection that sends none in this time is closed.

@@ -156,6 +156,12 @@ impl Blocks {
         &ids[..ids.partition_point(|&id| id != NONE)]
     }
 
+    /// The blocks that the view shows, ascending.
+    pub fn shown(&self, frustum: &Frustum) -> Vec<u32> {
+        let all = (0..self.bounds.len() as u32).into_par_iter().with_min_len(1 << 9);
+        all.filter(|&at| self.is_shown(at as usize, frustum)).collect()
+    }
+
     /// Whether the view shows block `at`: it may touch the picture and is fine enough, and the
     /// block that stands for it is not. Of each Gaussian one block of those that it is merged in is
     /// shown, or none where that cannot touch the picture.

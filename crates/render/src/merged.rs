@@ -396,3 +396,65 @@ fn merge(members: &[Member]) -> (Member, Vec<f64>) {
     merged.error = members.iter().map(|one| one.apart(&merged)).fold(0.0, f64::max);
     (merged, weights)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_error_is_that_of_the_members_and_what_merging_adds() {
+        let sphere = |x: f64, error: f64| Member {
+            mean: DVec3::X * x,
+            axes: DMat3::IDENTITY,
+            scales: DVec3::splat(0.5),
+            opacity: 0.1,
+            sum: 0.1,
+            error,
+        };
+        let of = |a: f64, b: f64| merge(&[sphere(-1.0, a), sphere(1.0, b)]).0.error;
+        // The centres move by 1, and the spread along x becomes the root of 0.5² + 1.
+        let step = 1.0 + 1.25_f64.sqrt() - 0.5;
+        assert!((of(0.0, 0.0) - step).abs() < 1e-12, "{} not {step}", of(0.0, 0.0));
+        assert!((of(0.25, 3.0) - step - 3.0).abs() < 1e-12, "{} not {step} + 3", of(0.25, 3.0));
+    }
+
+    #[test]
+    fn errors_add_up_from_layer_to_layer() {
+        let mut raw = RawGaussians::default();
+        for i in 0..1_000_u32 {
+            let place = |k: u32| (i.wrapping_mul(2_654_435_761).rotate_left(9 * k) % 97) as f32;
+            raw.means.push([place(0), place(1), place(2)]);
+            raw.quats.push([1.0, 0.0, 0.0, 0.0]);
+            raw.scales.push([0.5; 3]);
+            raw.opacities.push(0.1);
+            raw.sh.push([0.5; 3]);
+            raw.semantic_index.push(0);
+            raw.source.push(SourcePixel::default());
+        }
+        let own = Gaussians::restore(raw).expect("Gaussians");
+        let mut merger = Merger::new(&own);
+        let mut ids: Vec<u32> = (0..own.len() as u32).collect();
+        for layer in 0..4 {
+            let part = merger.merge(&ids);
+            let mut first = 0;
+            for (at, &end) in part.ends.iter().enumerate() {
+                for &id in &part.members[first..end as usize] {
+                    let of_member = match (id as usize).checked_sub(own.len()) {
+                        None => 0.0,
+                        Some(at) => merger.all.errors[at],
+                    };
+                    let [a, b] = [*merger.row(id).mean, part.raw.means[at]]
+                        .map(|mean| DVec3::from(mean.map(f64::from)));
+                    let least = f64::from(of_member) + a.distance(b);
+                    let error = f64::from(part.errors[at]);
+                    assert!(error >= least, "layer {layer}, {at}: {error} under {least}");
+                }
+                first = end as usize;
+            }
+            let next = merger.next_id();
+            merger.take(&part);
+            ids = (next..merger.next_id()).collect();
+        }
+        assert!(ids.len() < 200, "four layers: {}", ids.len());
+    }
+}

@@ -1,6 +1,8 @@
 //! The camera of a request, relative to the Gaussians' origin. It is computed in f64, before any
 //! number becomes f32.
 
+use std::ops::Range;
+
 use glam::{DMat3, DVec3};
 
 use super::{
@@ -99,6 +101,14 @@ impl View {
             width: cropped.width,
             height: cropped.height,
         })
+    }
+
+    /// The part of it in some rows of tiles.
+    pub(crate) fn band(&self, rows: &Range<u32>) -> Self {
+        let first = rows.start * TILE_SIZE;
+        let [x, y] = self.principal;
+        let height = (rows.end * TILE_SIZE).min(self.height) - first;
+        Self { principal: [x, y - f64::from(first)], height, ..*self }
     }
 
     /// The ray of the first pixel's centre, and its change to the next column and row: world axes,

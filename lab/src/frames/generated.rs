@@ -36,6 +36,19 @@ pub(super) fn scene(
     Ok((gaussians, Camera { intrinsics: Intrinsics { width, cx, ..square }, ..camera }))
 }
 
+/// The same with harmonics of a degree: small ones, that differ between neighbours.
+pub(super) fn with_degree(gaussians: Gaussians, degree: u8) -> Gaussians {
+    let count = (usize::from(degree) + 1).pow(2);
+    let mut raw = gaussians.into_raw();
+    raw.sh_degree = degree;
+    let more = |(i, first): (usize, &[f32; 3])| {
+        let small = move |k: usize| [0.05 * ((i + 7 * k) as f32 * 0.37).sin(); 3];
+        std::iter::once(*first).chain((1..count).map(small))
+    };
+    raw.sh = raw.sh.iter().enumerate().flat_map(more).collect();
+    scenes::checked(raw)
+}
+
 /// Writes a safetensors file: the scene as its arrays, `camera` as `[viewmat 16, fx, fy, cx, cy,
 /// width, height, near, background 3]`, `color` as the renderer drew it, and `more` by name,
 /// `[n, m]`.

@@ -18,7 +18,7 @@ use glam::DVec3;
 use segsplat_testing::{labels::table, scenes};
 use serde_json::{Value, json};
 
-use self::generated::{dump, scene};
+use self::generated::{dump, scene, with_degree};
 use crate::{
     error::{Error, Result},
     render::{
@@ -33,7 +33,7 @@ use crate::{
 };
 
 /// Most Gaussians of a generated scene.
-const GAUSSIANS_MAX: usize = 16 << 20;
+const GAUSSIANS_MAX: usize = 32 << 20;
 /// Most frames of the CPU renderer beside those of a GPU.
 const CPU_FRAMES_MAX: usize = 20;
 
@@ -61,6 +61,9 @@ pub(crate) struct Args {
     /// Entries of the bank that the scene has
     #[arg(long, default_value_t = 24)]
     bank: u16,
+    /// Degree of the harmonics
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u8).range(0..=3))]
+    degree: u8,
     /// Also times this many callers at once
     #[arg(long, default_value_t = 0)]
     callers: usize,
@@ -120,6 +123,10 @@ impl Args {
     /// The generated scene, and the view of it with every picture.
     fn scene(&self) -> Result<(Gaussians, RenderRequest)> {
         let (gaussians, camera) = scene(self.gaussians, self.bank, [self.width(), self.size])?;
+        let gaussians = match self.degree {
+            0 => gaussians,
+            degree => with_degree(gaussians, degree),
+        };
         Ok((gaussians, scenes::request(camera)))
     }
 }

@@ -1,6 +1,6 @@
 """The ranges of activations that cpu_graph.py computes in 8 bits.
 
-    python calibrate.py --graph geometry.onnx --data SHARED --out ranges.json [--views 2]
+    python calibrate.py --graph geometry.onnx --data SHARED --out ranges.json [--views 2] [--wider OLD.json]
 
 Inputs: planes that carry photographs, seen by two cameras, and sets of photos of the scenes that
 choose constants; never a scene that is reported. A range is the smallest and largest number of all.
@@ -95,15 +95,20 @@ def main():
     ap.add_argument("--data", required=True)
     ap.add_argument("--out", required=True)
     ap.add_argument("--views", type=int, default=2, help="photos of a set")
+    ap.add_argument("--planes", type=int, default=14, help="pairs of made pictures")
+    ap.add_argument("--wider", help="ranges of earlier weights, that are at least taken")
     args = ap.parse_args()
     g = Graph(args.graph)
     names = list(dict.fromkeys(x for n, _ in quantised(g) for x in (n.input[0], n.output[0])))
     model = onnx.load(args.graph)
     model.graph.output.extend(helper.make_tensor_value_info(n, TensorProto.FLOAT, None) for n in names)
     session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    inputs = [planes(args.data, seed) for seed in range(14)]
+    inputs = [planes(args.data, seed) for seed in range(args.planes)]
     inputs += [photos(args.data, scene, 3 * k, args.views) for scene in CHOOSE for k in range(3)]
     ranges = {}
+    if args.wider:
+        with open(args.wider) as file:
+            ranges = {name: found for name, found in json.load(file).items() if name in names}
     for each in inputs:
         for name, found in zip(names, session.run(names, each)):
             low, high = ranges.get(name, (0.0, 0.0))

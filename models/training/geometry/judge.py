@@ -15,11 +15,11 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 
-from splats import nearest_views, render, ssim
+from splats import nearest_views, render, ssim, with_inputs
 from sweep import Ranges, gray
 
 SIDE = 256
-REPORTED = ("fox", "red_kitchen", "duck_toy", "coke_can", "sceaux_castle")
+REPORTED = ("fox", "red_kitchen", "duck_toy", "coke_can")
 VIEWS = (2, 4, 8)
 HELD_OUT_MOST = 12  # triples of a held-out capture
 
@@ -116,8 +116,8 @@ class Scene:
 
 
 class Judge:
-    def __init__(self, scenes, captures, device):
-        """scenes: folder of the shared scenes; captures: folders held out."""
+    def __init__(self, scenes, captures, device, views=VIEWS):
+        """scenes: folder of the shared scenes; captures: folders held out; views: photos of a set."""
         self.device, self.scenes, self.items = device, {}, []
         folders = [(n, os.path.join(scenes, n), "report" if n in REPORTED else "choose") for n in sorted(os.listdir(scenes))]
         folders += [(os.path.basename(f), f, "held_out") for f in captures]
@@ -129,7 +129,7 @@ class Judge:
             for i, j, k in rows:
                 order = (scene.c2w[:, :3, 3] - scene.c2w[k, :3, 3]).norm(dim=1).argsort().tolist()
                 more = [x for x in order if x not in (i, j, k)]
-                sets = [[i, j, *more[: v - 2]] for v in VIEWS if len(more) >= v - 2]
+                sets = [[i, j, *more[: v - 2]] for v in views if len(more) >= v - 2]
                 self.items.append((use, name, sets, k))
 
     def figures(self, net, every=1):
@@ -168,7 +168,7 @@ class Judge:
         nb = nearest_views(c2w, min(len(views) - 1, 3))
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             out = net(img, K, c2w, put(near / s), put(far / s), nb)
-        out["c2w"], out["fx"] = c2w, K[..., 0, 0]
+        out = with_inputs(out, img, K, c2w)
         pics = [render(out, tgt, Kt, side, side)[0, 0].clamp(0, 1) for side in (SIDE, 2 * SIDE)]
         want = [x[target].float() / 255 for x in (scene.small, scene.large)]
         psnr = [-10 * math.log10(max(((p - w) ** 2).mean().item(), 1e-9)) for p, w in zip(pics, want)]

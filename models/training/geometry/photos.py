@@ -18,7 +18,7 @@ from sweep import Ranges, gray
 PX_MOST = 0.9  # photos whose poses are worse are left out
 # Baseline over the median depth of the target, and how often each step is drawn.
 ANGLES = [0.015, 0.04, 0.08, 0.16, 0.3, 0.5, 1.0]
-SHARES = [0.08, 0.17, 0.25, 0.25, 0.17, 0.08]
+SHARES = [0.08, 0.2, 0.27, 0.25, 0.15, 0.05]
 GAIN_MOST = 0.4
 
 
@@ -72,7 +72,7 @@ class Capture:
                 for j in near[a + 1 :]:
                     b = self.distance[i, j]
                     away = np.linalg.norm(c[t] - (c[i] + c[j]) / 2)
-                    if away > 0.7 * b or min(self.overlap[i, j], self.overlap[j, i]) < 0.2 or max(self.overlap[t, i], self.overlap[t, j]) < 0.6:
+                    if away > 0.5 * b or min(self.overlap[i, j], self.overlap[j, i]) < 0.2 or max(self.overlap[t, i], self.overlap[t, j]) < 0.6:
                         continue
                     step = np.searchsorted(ANGLES, b * self.inverse[t, 1]) - 1
                     if 0 <= step < len(SHARES):

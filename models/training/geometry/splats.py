@@ -2,18 +2,28 @@
 import torch
 import torch.nn.functional as F
 
-from model import SH_C0
+from model import SH_C0, pixel_grid
 
 
 BLUR = 0.3  # square pixels that the renderer adds
+CELLS = 16  # of the backdrop, along a side of a photo
 FRONT = 4  # photos that are in front in a view
 TURN_COST = 0.5  # of a radian, in steps of a median depth
 OWN_SIZE = 1.25  # up to this magnification a view counts as of the photos' own size
 
 
+def with_inputs(out, images, K, c2w):
+    """The network's answer with what it was asked: `render` needs both."""
+    return out | {"images": images, "K": K, "c2w": c2w, "fx": K[..., 0, 0]}
+
+
 def render(out, c2w, K, H, W):
-    """Pictures [B,T,3,H,W] of the network's Gaussians from cameras c2w [B,T,4,4], K normalised."""
+    """Pictures [B,T,3,H,W] of the network's Gaussians from cameras c2w [B,T,4,4], K normalised.
+
+    Behind the Gaussians is the backdrop, as in views of the product.
+    """
     B, T = c2w.shape[:2]
+    behind = backdrop(out, c2w, K, H, W)
     g = world_gaussians(out)
     size = torch.tensor([[W], [H], [1]], device=K.device, dtype=torch.float32)
     views = torch.linalg.inv(c2w).flatten(0, 1).contiguous()  # [B*T,4,4]
@@ -22,12 +32,35 @@ def render(out, c2w, K, H, W):
     g["scales"] = (g["scales"] ** 2 + lost_blur(g["means"], g.pop("width"), views, K)[..., None]).sqrt()
     front = in_front(out, c2w)
     if front is None:
-        img = rasterized(g, views, K, W, H)[0]
+        img, alpha = rasterized(g, views, K, W, H)
     else:  # those in front first, then the others behind them
         front = front.flatten(0, 1).repeat_interleave(out["means"][0, 0, ..., 0].numel(), 1)
         img, alpha = rasterized(g | {"opacities": g["opacities"] * front}, views, K, W, H)
-        img = img + (1 - alpha) * rasterized(g | {"opacities": g["opacities"] * ~front}, views, K, W, H)[0]
-    return img.permute(0, 1, 4, 2, 3).reshape(B, T, 3, H, W)
+        others, others_alpha = rasterized(g | {"opacities": g["opacities"] * ~front}, views, K, W, H)
+        img, alpha = img + (1 - alpha) * others, alpha + (1 - alpha) * others_alpha
+    return (img + (1 - alpha) * behind).permute(0, 1, 4, 2, 3).reshape(B, T, 3, H, W)
+
+
+@torch.no_grad()
+def backdrop(out, c2w, K, H, W):
+    """The photos' colours by direction [B*T,1,H,W,3], blurred to cells: about what the product draws behind a scene.
+
+    A photo counts less the farther outside of it a direction is.
+    """
+    B, T = c2w.shape[:2]
+    V, h, w = out["images"].shape[1], H // 8, W // 8
+    cells = F.adaptive_avg_pool2d(out["images"].float().flatten(0, 1), CELLS).reshape(B, V, 3, CELLS, CELLS)
+    rays = pixel_grid(h, w, c2w) @ torch.linalg.inv(K).transpose(-1, -2)  # [B,T,P,3]
+    turn = out["c2w"][:, None, :, :3, :3].transpose(-1, -2) @ c2w[:, :, None, :3, :3]  # [B,T,V,3,3]
+    seen = rays[:, :, None] @ turn.transpose(-1, -2) @ out["K"][:, None].transpose(-1, -2)
+    ahead = seen[..., 2:] > 1e-3
+    xy = torch.where(ahead, seen[..., :2] / seen[..., 2:].clamp(min=1e-3) * 2 - 1, torch.full_like(seen[..., :2], 4.0)).clamp(-4, 4)
+    weight = torch.exp(-6 * (xy.abs().amax(-1) - 1).clamp(min=0))[..., None, :, None]  # [B,T,V,1,P,1]
+    source = cells[:, None].expand(-1, T, -1, -1, -1, -1).flatten(0, 2)
+    colour = F.grid_sample(source, xy.flatten(0, 2)[:, :, None], padding_mode="border", align_corners=False)
+    colour = colour.reshape(B, T, V, 3, h * w, 1)
+    mean = ((colour * weight).sum(2) / weight.sum(2)).reshape(B * T, 3, h, w)
+    return F.interpolate(mean, (H, W), mode="bilinear", align_corners=False).permute(0, 2, 3, 1)[:, None]
 
 
 def rasterized(g, views, K, W, H):
@@ -147,7 +180,7 @@ def depth_loss(out, depth, near, far):
     return total, ce, (out["u1"] - u).abs().mean()
 
 
-def picture_loss(pic, want, robust=None):
+def picture_loss(pic, want, robust=None, log_weight=0.02):
     """MSE, log MSE (the mean PSNR itself) and SSIM of pictures [M,3,H,W]; also the plain MSE.
 
     With `robust` an error far over it counts little more than one of its size: what moved, shone
@@ -156,7 +189,7 @@ def picture_loss(pic, want, robust=None):
     err = (pic - want) ** 2
     plain = err.flatten(1).mean(1)
     each = plain if robust is None else (err / (1 + err / robust**2)).flatten(1).mean(1)
-    loss = 6 * each.mean() + 0.02 * torch.log(each + 1e-4).mean() + 0.15 * (1 - ssim(pic, want)).mean()
+    loss = 6 * each.mean() + log_weight * torch.log(each + 1e-4).mean() + 0.15 * (1 - ssim(pic, want)).mean()
     return loss, plain.mean().detach()
 
 

@@ -23,14 +23,14 @@ import time
 import torch
 import torch.distributed as dist
 
+from judge import VIEWS as VIEWS_JUDGED
 from judge import Judge
 from model import GeometryNet
-from splats import depth_loss, nearest_views, picture_loss, render
+from splats import depth_loss, nearest_views, picture_loss, render, with_inputs
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 SHAPES = [(256, 256)] * 7 + [(224, 288), (288, 224), (192, 320), (320, 192)]
 VIEWS = ["2:0.5", "3:0.08", "4:0.18", "6:0.09", "8:0.15"]
-ZOOM_SHARE = 0.3
 PART = 15 << 20  # bytes of one file of weights
 
 
@@ -53,6 +53,10 @@ def parse():
     ap.add_argument("--seed", type=int, default=1)
     ap.add_argument("--views", nargs="*", default=VIEWS, help="photos of a set and how often it is drawn, N:SHARE")
     ap.add_argument("--robust", type=float, help="an error of a real photo far over this counts no more")
+    ap.add_argument("--log-weight", type=float, default=0.02, help="of the logarithm of the error in the loss")
+    ap.add_argument("--zoom-share", type=float, default=0.3, help="share of the views with twice the pixels")
+    ap.add_argument("--judge-views", type=int, nargs="*", default=VIEWS_JUDGED, help="photos of the sets that are judged")
+    ap.add_argument("--warm-up", type=int, default=200, help="steps")
     ap.add_argument("--batch", type=int, default=16, help="pairs a step; fewer sets of more views")
     return ap.parse_args()
 
@@ -63,7 +67,7 @@ class Ranks:
     def __init__(self):
         self.many = "RANK" in os.environ
         if self.many:
-            dist.init_process_group("nccl")
+            dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
         self.rank, self.count = (dist.get_rank(), dist.get_world_size()) if self.many else (0, 1)
         self.device = torch.device("cuda", self.rank) if torch.cuda.is_available() else torch.device("cpu")
         if self.device.type == "cuda":
@@ -116,6 +120,22 @@ def extension():
     return load("raycast", [os.path.join(HERE, "raycast.cu")], extra_cflags=["-O3"], extra_cuda_cflags=["-O3", "--use_fast_math"])
 
 
+def write_parts(folder, what, state, step):
+    """In parts of at most 15 MiB; the parts of an earlier step go when all are there."""
+    blob = io.BytesIO()
+    torch.save(state, blob)
+    blob = blob.getvalue()
+    old = glob.glob(os.path.join(folder, f"{what}-*"))
+    count = -(-len(blob) // PART)
+    names = [os.path.join(folder, f"{what}-{step:06d}-{i}of{count}.bin") for i in range(count)]
+    for i, name in enumerate(names):
+        with open(name + ".tmp", "wb") as file:
+            file.write(blob[i * PART : (i + 1) * PART])
+        os.replace(name + ".tmp", name)
+    for name in set(old) - set(names):
+        os.remove(name)
+
+
 class Trainer:
     def __init__(self, args, ranks, start):
         self.args, self.ranks, self.start = args, ranks, start
@@ -135,7 +155,7 @@ class Trainer:
         self.say(loaded=round(time.time() - start, 1), captures=self.data.photos.about() if self.data.photos else None)
         if args.scenes and ranks.rank == 0:
             held_out = [os.path.dirname(p) for p in sorted(glob.glob(os.path.join(args.data or "", "*", "cameras.json"))) if '"held_out": true' in open(p).read(400)]
-            self.judge_of = Judge(args.scenes, held_out, ranks.device)
+            self.judge_of = Judge(args.scenes, held_out, ranks.device, args.judge_views)
             self.say(judge_loaded=round(time.time() - start, 1), triples=len(self.judge_of.items))
 
     def say(self, **kw):
@@ -161,21 +181,8 @@ class Trainer:
         self.say(judge=tag, every=every, step=self.step, t=round(time.time() - self.start), took=round(time.time() - begun, 1), uses=by_use, scenes=by_scene)
 
     def write(self, what, state):
-        """In parts of at most 15 MiB; the parts of an earlier step go when all are there."""
-        if self.ranks.rank:
-            return
-        blob = io.BytesIO()
-        torch.save(state, blob)
-        blob = blob.getvalue()
-        old = glob.glob(os.path.join(self.args.out, f"{what}-*"))
-        count = -(-len(blob) // PART)
-        names = [os.path.join(self.args.out, f"{what}-{self.step:06d}-{i}of{count}.bin") for i in range(count)]
-        for i, name in enumerate(names):
-            with open(name + ".tmp", "wb") as file:
-                file.write(blob[i * PART : (i + 1) * PART])
-            os.replace(name + ".tmp", name)
-        for name in set(old) - set(names):
-            os.remove(name)
+        if not self.ranks.rank:
+            write_parts(self.args.out, what, state, self.step)
 
     def save(self):
         self.write("weights", {k: v.half() for k, v in self.ema.items()})
@@ -215,11 +222,11 @@ class Trainer:
         counts, shares = zip(*(each.split(":") for each in args.views))
         V = int(draw.choices(counts, [float(share) for share in shares])[0])
         H, W = draw.choice(SHAPES)
-        zoom = 2 if draw.random() < ZOOM_SHARE and not depth_only else 1
+        zoom = 2 if draw.random() < args.zoom_share and not depth_only else 1
         B, T = max(args.batch * 2 // V, 1), 2 if zoom == 1 else 1
         with torch.no_grad():
             images, targets, mask, depth, K, c2w, near, far = self.data.batch(real, B, V, T, H, W, zoom, wide)
-        lr = args.lr * min(1.0, (self.step + 1) / 200) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(share, 1))))
+        lr = args.lr * min(1.0, (self.step + 1) / args.warm_up) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(share, 1))))
         for group in self.opt.param_groups:
             group["lr"] = lr
         with torch.autocast(device.type, dtype=torch.bfloat16):
@@ -229,12 +236,11 @@ class Trainer:
             dl, ce, err = depth_loss(out, depth, near, far)
             loss = dl + 0.05 * ce
         if not depth_only:
-            out["c2w"], out["fx"] = c2w[:, :V], K[:, :V, 0, 0]
-            pic = render(out, c2w[:, V:], K[:, V:], H * zoom, W * zoom).flatten(0, 1)
+            pic = render(with_inputs(out, images, K[:, :V], c2w[:, :V]), c2w[:, V:], K[:, V:], H * zoom, W * zoom).flatten(0, 1)
             want = targets.flatten(0, 1)
             if mask is not None:  # where no input looks there is nothing to learn
                 want = torch.where(mask.flatten(0, 1) > 0, want, pic.detach())
-            picture, mse = picture_loss(pic, want, args.robust if real else None)
+            picture, mse = picture_loss(pic, want, args.robust if real else None, args.log_weight)
             loss = 0.25 * loss + picture
         self.update(loss)
         kind = "real" if real else "made"
@@ -278,7 +284,8 @@ class Trainer:
 def main():
     start = time.time()
     args = parse()
-    torch.backends.cuda.matmul.allow_tf32 = True
+    # Products of matrices that are not in bf16 are those of cameras: TF32 moves a point by a tenth of a pixel.
+    torch.backends.cuda.matmul.allow_tf32 = False
     torch.backends.cudnn.allow_tf32 = True
     torch.backends.cudnn.benchmark = True
     trainer = Trainer(args, Ranks(), start)

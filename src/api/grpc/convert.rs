@@ -7,8 +7,8 @@ use crate::{
     error::{Error, Result, short},
     scene::{
         CameraToWorld, CameraUse, CamerasMode, CamerasReport, CamerasSource, DropCount,
-        HealthReport, Intrinsics, LeftOutPhoto, MovedCamera, PlacedPhoto, Refine, RefineReport,
-        RefineState, ScoringMethod, SemanticsReport, StageTime, Warning,
+        GrowthState, HealthReport, Intrinsics, LeftOutPhoto, MovedCamera, PlacedPhoto, Refine,
+        RefineReport, RefineState, ScoringMethod, SemanticsReport, StageTime, Warning,
     },
     service::{
         BackgroundSpec, Boxes, CallerLimits, CameraSpec, Density, ERROR_FAST, Event, ExportFormat,
@@ -56,6 +56,13 @@ pub(super) fn scene(status: SceneStatus) -> pb::Scene {
             state: pb::RefineState::from(status.refinement.state).into(),
             fraction: status.refinement.fraction,
             error: status.refinement.error.map(scene_error),
+        }),
+        growth: Some(pb::GrowthStatus {
+            state: pb::GrowthState::from(status.growth.state).into(),
+            waiting: status.growth.waiting,
+            stage: status.growth.stage.unwrap_or_default(),
+            fraction: status.growth.fraction,
+            error: status.growth.error.map(scene_error),
         }),
     )
 }
@@ -524,6 +531,7 @@ macro_rules! both_ways {
 
 to_number! {
     SceneState = SceneState { Queued, Running, Done, Failed, Cancelled }
+    GrowthState = GrowthState { None, Running, Done, Failed }
     RefineState = RefineState { None, Running, Done, Failed }
     SemanticsState = SemanticsState { Off, None, Running, Ready, Failed }
     CamerasSource = CamerasSource { Given, Solved }

@@ -19,8 +19,8 @@ use crate::{
     error::{Error, ErrorCode, Result},
     scene::{CamerasMode, SceneId, Upload, UploadCameras},
     service::{
-        CreateScene, Export, PageRequest, PictureKind, SceneStatus, SemanticsMode, ViewSpec,
-        ViewTimes, ViewsSpec,
+        AddPhotos, CreateScene, Export, PageRequest, PictureKind, SceneStatus, SemanticsMode,
+        ViewSpec, ViewTimes, ViewsSpec,
     },
 };
 
@@ -62,7 +62,7 @@ impl pb::scene_service_server::SceneService for Api {
     ) -> Answer<Self::WatchSceneStream> {
         answer(self, request, |api, request| async move {
             let id = request.scene_id.parse()?;
-            let events = api.service.watch(&id).await?;
+            let events = api.service.watch_for(&id, request.semantics).await?;
             let cut_off = stream::once(async move { unless_whole(&api, &id).await.err() });
             let cut_off = cut_off.filter_map(|error| ready(error.map(|e| Err(logged(&e)))));
             Ok(events.map(|event| Ok(convert::event(event))).chain(cut_off).boxed())
@@ -108,6 +108,23 @@ impl pb::scene_service_server::SceneService for Api {
         answer(self, request, |api, request| async move {
             let refine = convert::refine(&request.refine)?.unwrap_or_default();
             Ok(convert::scene(api.service.refine(&request.scene_id.parse()?, refine).await?))
+        })
+        .await
+    }
+
+    async fn add_photos(
+        &self,
+        request: Request<Streaming<pb::AddPhotosRequest>>,
+    ) -> Answer<pb::Scene> {
+        answer(self, request, add_photos).await
+    }
+
+    async fn remove_photo(&self, request: Request<pb::RemovePhotoRequest>) -> Answer<pb::Scene> {
+        answer(self, request, |api, request| async move {
+            let pb::RemovePhotoRequest { scene_id, name, wait_ms } = request;
+            let wait = wait_ms.map(Duration::from_millis);
+            let left = api.service.remove_photo(&scene_id.parse()?, name, wait).await?;
+            Ok(convert::scene(left))
         })
         .await
     }
@@ -238,6 +255,56 @@ async fn create(
         (Some(error), Some(_)) => Err(error.to_error()),
         _ => Ok(convert::scene(created.status)),
     }
+}
+
+async fn add_photos(api: Api, mut messages: Streaming<pb::AddPhotosRequest>) -> Result<pb::Scene> {
+    use pb::{add_photos_header::Cameras, add_photos_request::Part};
+    let limits = api.service.limits();
+    let mut upload = UploadBuilder::new(&limits, &api.uploads).at_least(1);
+    let mut header = None;
+    loop {
+        let next = messages.message().await.map_err(|status| unreadable(&status))?;
+        let Some(message) = next else { break };
+        let part = message.part.ok_or_else(|| Error::invalid("upload: an empty message"))?;
+        match (part, &header) {
+            (Part::Header(mut first), None) => {
+                // Before the photos are sent.
+                let id: SceneId = first.scene_id.parse()?;
+                api.service.get(&id).await?;
+                let cameras = first.cameras.take().map(|cameras| match cameras {
+                    Cameras::TransformsJson(json) => UploadCameras::Transforms(json.into()),
+                    Cameras::CamerasJson(json) => UploadCameras::Cameras(json.into()),
+                });
+                cameras.map_or(Ok(()), |cameras| upload.begin_cameras(cameras))?;
+                header = Some((id, first));
+            }
+            (Part::Header(_), Some(_)) => {
+                return Err(Error::invalid("upload: a second header"));
+            }
+            (_, None) => {
+                return Err(Error::invalid("upload: the first message must be the header"));
+            }
+            (Part::Photo(piece), Some(_)) => {
+                if !piece.name.is_empty() {
+                    upload.begin_photo(&piece.name)?;
+                }
+                upload.extend(&piece.data)?;
+            }
+            (Part::Archive(piece), Some(_)) => {
+                upload.begin_archive();
+                upload.extend(&piece)?;
+            }
+        }
+    }
+    let nothing = || Error::invalid("upload: no header, nothing was sent");
+    let (id, header) = header.ok_or_else(nothing)?;
+    let (upload, _guard) = upload.finish()?;
+    let request = AddPhotos {
+        upload,
+        idempotency_key: not_empty(header.idempotency_key),
+        wait: header.wait_ms.map(Duration::from_millis),
+    };
+    Ok(convert::scene(api.service.add_photos(&id, request).await?.status))
 }
 
 async fn read_upload(

@@ -17,6 +17,7 @@ mod inference;
 mod middleware;
 mod multipart;
 mod openapi;
+mod photos;
 mod render;
 mod scenes;
 mod serve;
@@ -75,6 +76,8 @@ pub fn routes() -> Vec<Route> {
         ("DELETE", "/v1/scenes/{id}", "delete_scene", write, delete(scenes::delete)),
         ("GET", "/v1/scenes/{id}/events", "watch_scene", read, get(scenes::events)),
         ("POST", "/v1/scenes/{id}/refine", "refine_scene", write, post(scenes::refine)),
+        ("POST", "/v1/scenes/{id}/photos", "add_photos", write, post(photos::add)),
+        ("DELETE", "/v1/scenes/{id}/photos/{name}", "remove_photo", write, delete(photos::remove)),
         ("GET", "/v1/scenes/{id}/edits", "get_edits", read, get(edits::get)),
         ("PUT", "/v1/scenes/{id}/edits", "set_edits", write, put(edits::set)),
         ("GET", "/v1/scenes/{id}/view", "render_view", read, get(render::view)),

@@ -90,13 +90,15 @@ enum Sent {
 pub(super) struct ArchiveBody(String);
 
 /// Reads the parts of `request`, or the archive that its body is; text parts that are options go to
-/// `fields`.
+/// `fields`. So many photos must come at least.
 pub(super) async fn read_upload(
     api: &Api,
     request: Request,
     fields: &mut Fields,
+    photos_min: usize,
 ) -> Result<(Upload, UploadGuard), ApiError> {
-    let limits = api.service.limits();
+    let limits = &api.service.limits();
+    let upload = UploadBuilder::new(limits, &api.uploads).at_least(photos_min);
     let length = text_of(request.headers(), "content-length");
     let length = length.and_then(|value| value.parse::<usize>().ok());
     let has_room = api.service.has_room(request.headers().contains_key("idempotency-key"));
@@ -120,8 +122,8 @@ pub(super) async fn read_upload(
              as application/zip or application/x-tar",
         )),
         (_, Err(full), _) => Err(full),
-        (_, Ok(()), Ok(Sent::Form(mut form))) => parts(api, &mut form, fields, &body).await,
-        (_, Ok(()), Ok(Sent::Archive(whole))) => archive(api, whole, &body).await,
+        (_, Ok(()), Ok(Sent::Form(mut form))) => parts(upload, &mut form, fields, &body).await,
+        (_, Ok(()), Ok(Sent::Archive(whole))) => archive(upload, whole, &body).await,
     };
     let read = read.map_err(|error| body.too_long().unwrap_or(error));
     if read.is_err() {
@@ -147,9 +149,11 @@ pub(super) fn read_on(
     tokio::spawn(tokio::time::timeout(DRAIN_TIME_MAX, dropped));
 }
 
-async fn archive(api: &Api, whole: Body, body: &WatchedBody) -> Result<(Upload, UploadGuard)> {
-    let limits = api.service.limits();
-    let mut upload = UploadBuilder::new(&limits, &api.uploads);
+async fn archive(
+    mut upload: UploadBuilder<'_>,
+    whole: Body,
+    body: &WatchedBody,
+) -> Result<(Upload, UploadGuard)> {
     upload.begin_archive();
     let mut pieces = whole.into_data_stream();
     while let Some(piece) = pieces.next().await {
@@ -161,13 +165,11 @@ async fn archive(api: &Api, whole: Body, body: &WatchedBody) -> Result<(Upload, 
 }
 
 async fn parts(
-    api: &Api,
+    mut upload: UploadBuilder<'_>,
     form: &mut Multipart,
     fields: &mut Fields,
     body: &WatchedBody,
 ) -> Result<(Upload, UploadGuard)> {
-    let limits = api.service.limits();
-    let mut upload = UploadBuilder::new(&limits, &api.uploads);
     let all = OPTIONS.concat();
     let mut options = all.clone();
     loop {

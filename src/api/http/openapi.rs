@@ -17,7 +17,7 @@ use utoipa::{
 use super::{
     edits,
     error::{ErrorBody, PROBLEM, ProblemBody},
-    health, inference, render, scenes, texts, viewer, views,
+    health, inference, photos, render, scenes, texts, viewer, views,
 };
 use crate::{
     api::Api,
@@ -49,7 +49,7 @@ pub(super) async fn document(State(api): State<Api>) -> Json<Value> {
     ),
     paths(
         scenes::create, scenes::list, scenes::get, scenes::delete, scenes::events, scenes::refine,
-        edits::get, edits::set,
+        photos::add, photos::remove, edits::get, edits::set,
         render::view, views::views, texts::query, texts::pick, render::export, render::features,
         health::models, health::live, health::ready, health::metrics, document, viewer::index,
         viewer::sample, inference::server_metadata, inference::server_live,

@@ -25,7 +25,7 @@ use super::{
 use crate::{
     api::{Api, request_id, server_timing, upload::check_bundle},
     error::{Error, Result},
-    scene::{Refine, SceneId},
+    scene::{Refine, SceneId, SemanticsState},
     service::{CreateScene, Event, Page, PageRequest, SceneOptions, SceneState, SceneStatus},
 };
 
@@ -70,7 +70,8 @@ pub(super) async fn create(
     let preferred = preferred_wait(request.headers());
     let request_id = request.headers().get(request_id::HEADER);
     let request_id = request_id.and_then(|id| id.to_str().ok()).map(str::to_owned);
-    let (upload, _guard) = read_upload(&api, request, &mut fields).await?;
+    let least = api.service.limits().photos_min;
+    let (upload, _guard) = read_upload(&api, request, &mut fields, least).await?;
     let (options, wait) = options(&api, fields)?;
     // What the query says counts.
     let preferred = preferred.filter(|_| wait.is_none());
@@ -177,11 +178,21 @@ pub(super) async fn refine(
     Ok((StatusCode::ACCEPTED, Json(api.service.refine(&id, refine).await?)))
 }
 
+/// How long a scene is watched.
+#[derive(Debug, Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct WatchParams {
+    /// Go on after the scene is made until its semantics are: who asks a first text at the same
+    /// time sees all of its stages.
+    semantics: bool,
+}
+
 /// What happens to a scene, as it happens
 #[utoipa::path(
     get, path = "/v1/scenes/{id}/events", operation_id = "watch_scene", tag = "scenes",
     params(
-        Id,
+        Id, WatchParams,
         ("Last-Event-ID" = Option<String>, Header, description = "The id of the last event seen"),
     ),
     responses(
@@ -196,19 +207,20 @@ pub(super) async fn events(
     CallerApi(api): CallerApi,
     Id(id): Id,
     headers: HeaderMap,
-    fields: Fields,
+    mut fields: Fields,
 ) -> Result<Response, ApiError> {
+    let WatchParams { semantics } = fields.take()?;
     fields.finish()?;
-    let events = api.service.watch(&id).await?;
+    let events = api.service.watch_for(&id, semantics).await?;
     let seen = text_of(&headers, "last-event-id");
-    if seen.is_some() && seen == end_of(&api, &id).await.as_deref() {
+    if seen.is_some() && seen == end_of(&api, &id, semantics).await.as_deref() {
         return Ok(StatusCode::NO_CONTENT.into_response());
     }
     // A server that stops ends the stream: the caller comes back, to the next server.
     let events = events.then(move |event| {
         let (api, id) = (api.clone(), id.clone());
         async move {
-            let id = end_of(&api, &id).await;
+            let id = end_of(&api, &id, semantics).await;
             let event = sse_event(&event);
             Ok::<_, Infallible>(id.into_iter().fold(event, sse::Event::id))
         }
@@ -217,10 +229,13 @@ pub(super) async fn events(
     Ok(Sse::new(events).keep_alive(keep_alive).into_response())
 }
 
-/// The id of the last event of a scene to which nothing more will happen.
-async fn end_of(api: &Api, id: &SceneId) -> Option<String> {
+/// The id of the last event of a scene to which nothing more will happen; with `semantics` not
+/// before they are made, or never will be.
+async fn end_of(api: &Api, id: &SceneId, semantics: bool) -> Option<String> {
     let status = api.service.get(id).await.ok()?;
-    let over = status.is_settled() && !status.is_refined_now();
+    let of = &status.semantics;
+    let awaited = semantics && of.available && of.state != SemanticsState::Ready;
+    let over = status.is_settled() && !status.is_refined_now() && !awaited;
     over.then(|| format!("{}-{}", status.state, status.version))
 }
 
@@ -241,7 +256,7 @@ fn options(api: &Api, mut fields: Fields) -> Result<(SceneOptions, Option<Durati
 
 /// Seconds of the preference `wait` (RFC 7240), the first one that is there. A preference that is
 /// not understood is left alone, as that document asks.
-fn preferred_wait(headers: &HeaderMap) -> Option<u32> {
+pub(super) fn preferred_wait(headers: &HeaderMap) -> Option<u32> {
     let values = headers.get_all("prefer").into_iter().filter_map(|value| value.to_str().ok());
     let mut preferences = values.flat_map(|value| value.split(','));
     preferences.find_map(|preference| {
@@ -253,7 +268,7 @@ fn preferred_wait(headers: &HeaderMap) -> Option<u32> {
 }
 
 /// 1 to 255 printable ASCII characters, once.
-fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>> {
+pub(super) fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>> {
     let mut given = headers.get_all("idempotency-key").iter();
     let Some(value) = given.next() else { return Ok(None) };
     if given.next().is_some() {

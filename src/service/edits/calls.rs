@@ -96,7 +96,8 @@ impl Shared {
                 self.jobs.lose_semantics(&base.meta.id)?;
                 self.jobs.understand(&base.meta.id)?;
             }
-            let found = resolve::resolve(&self.backend, &limits, base, &list.specs)?;
+            let find = |scene: &Scene, texts: &[String]| self.jobs.find_words(scene, texts);
+            let found = resolve::resolve(&self.backend, Some(&find), &limits, base, &list.specs)?;
             (found.gaussians, found.counts)
         } else {
             let found = edited(&list.resolved, &base.gaussians, limits.gaussians_max)?;
@@ -153,7 +154,7 @@ impl OfflineService {
     /// As there; `scene_not_ready` for texts and picks of a scene without semantics.
     pub fn edit(&self, scene: &Arc<Scene>, specs: &[EditSpec]) -> Result<(Scene, SceneEdits)> {
         resolve::check(specs, &self.limits)?;
-        let found = resolve::resolve(&self.backend, &self.limits, scene, specs)?;
+        let found = resolve::resolve(&self.backend, None, &self.limits, scene, specs)?;
         let gaussians = found.gaussians.len() as u64;
         let uncovered = uncovered(&scene.meta.cameras, &scene.gaussians, &found.gaussians);
         let mut after = scene.after_edits(found.gaussians, String::new());
@@ -206,7 +207,8 @@ impl Service {
                 Some(SemanticScene { scene, .. }) => scene,
                 None => inner.load(&access)?,
             };
-            let found = resolve::resolve(&inner.backend, &limits, &base, &specs)?;
+            let find = |scene: &Scene, texts: &[String]| inner.jobs.find_words(scene, texts);
+            let found = resolve::resolve(&inner.backend, Some(&find), &limits, &base, &specs)?;
             inner.put_edits(&base, specs, found)
         })
         .await?

@@ -1,5 +1,5 @@
-//! From what callers ask for to edits of Gaussians: texts become entries of the bank, parts and
-//! picks become entries and a box.
+//! From what callers ask for to edits of Gaussians: texts become entries of the bank, or the
+//! Gaussians that a network found in the photos; parts and picks become these and a box.
 
 use std::sync::Arc;
 
@@ -14,7 +14,7 @@ use crate::{
     service::{
         pick,
         request::PickSpec,
-        search::{Backend, SceneTexts, ScoringChoice, SemanticScene},
+        search::{Backend, FindWords, SceneTexts, ScoringChoice, SemanticScene},
         texts,
     },
 };
@@ -46,9 +46,11 @@ pub(super) fn check(specs: &[EditSpec], limits: &Limits) -> Result<()> {
     Ok(())
 }
 
-/// Resolves checked edits on a scene that has none, one after the other. Blocks.
+/// Resolves checked edits on a scene that has none, one after the other. Texts take what a query
+/// shows: with `find` they are found in the scene's photos, where that can be. Blocks.
 pub(super) fn resolve(
     backend: &Arc<Backend>,
+    find: Option<&FindWords<'_>>,
     limits: &Limits,
     base: &Arc<Scene>,
     specs: &[EditSpec],
@@ -58,10 +60,10 @@ pub(super) fn resolve(
     for (i, spec) in specs.iter().enumerate() {
         let at = format!("edits[{i}]");
         let of = match spec.asked(&at, limits)? {
-            Asked::Place(place) => Selected { entries: None, within: vec![place] },
+            Asked::Place(place) => Selected { within: vec![place], ..Selected::default() },
             Asked::Text { text, parts, scoring } => {
                 let how = ScoringChoice { preset: None, changes: scoring };
-                let scored = SceneTexts::new(backend, semantic(base, &at)?, &how, &[text], None)?;
+                let scored = SceneTexts::new(backend, semantic(base, &at)?, &how, &[text], find)?;
                 of_text(&scored, base, &editing, parts.as_deref(), limits, &at)?
             }
             Asked::Point(point) => {
@@ -100,14 +102,33 @@ fn of_text(
     at: &str,
 ) -> Result<Selected> {
     let entries = scored.texts.first().map_or_else(Vec::new, |text| text.selected());
+    let index = scored.of.scene.gaussians.semantic_index();
+    let of_photos = scored.is_of_photos();
     let within = match parts {
         None => Vec::new(),
         Some(parts) => {
-            let now = base.after_edits(editing.gaussians()?, String::new());
+            let mut now = editing.gaussians()?;
+            if of_photos {
+                let entry = |number: u32| index[number as usize];
+                now =
+                    now.with_semantic_index(editing.numbers().into_iter().map(entry).collect())?;
+            }
+            let now = base.after_edits(now, String::new());
             part_boxes(scored, &now, &entries, parts, limits, at)?
         }
     };
-    Ok(Selected { entries: Some(entries), within })
+    if !of_photos {
+        return Ok(Selected { entries: Some(entries), within, ..Selected::default() });
+    }
+    // Entries of such texts are of this call.
+    let mut numbers: Vec<[u32; 2]> = Vec::new();
+    for (number, _) in (0..).zip(index).filter(|(_, m)| entries.binary_search(m).is_ok()) {
+        match numbers.last_mut() {
+            Some([first, count]) if *first + *count == number => *count += 1,
+            _ => numbers.push([number, 1]),
+        }
+    }
+    Ok(Selected { numbers: Some(numbers), within, ..Selected::default() })
 }
 
 /// The thing at a pixel of a view of the scene as it is now.
@@ -133,7 +154,7 @@ fn of_point(now: &Scene, point: DVec3) -> Selected {
     };
     match nearest {
         Some((i, &entry)) if away(i) <= reach(i) => part_with(now, i as u64, entry),
-        _ => Selected { entries: Some(Vec::new()), within: Vec::new() },
+        _ => Selected { entries: Some(Vec::new()), ..Selected::default() },
     }
 }
 
@@ -143,7 +164,8 @@ fn part_with(now: &Scene, number: u64, entry: u16) -> Selected {
     let found = instances(now, &[entry], &all);
     let holds = |part: &&Instance| part.gaussians.iter().any(|&i| u64::from(i) == number);
     let within = found.iter().find(holds).map(|part| box_of(part, &now.gaussians));
-    Selected { entries: Some(vec![entry]), within: within.into_iter().collect() }
+    let within = within.into_iter().collect();
+    Selected { entries: Some(vec![entry]), within, ..Selected::default() }
 }
 
 fn semantic(base: &Arc<Scene>, at: &str) -> Result<SemanticScene> {

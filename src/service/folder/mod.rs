@@ -102,7 +102,6 @@ impl FolderPixels for Pixels<'_> {
         let Some(upload) = self.upload.filter(|upload| upload.splats.is_none()) else {
             return Ok(());
         };
-        let mut numbers = 0..;
         let meta = &self.scene.meta;
         let known = KnownCameras {
             mode: meta.provenance.options.cameras,
@@ -110,14 +109,14 @@ impl FolderPixels for Pixels<'_> {
             report: &meta.report.cameras,
         };
         each(upload, known, &self.limits, |sent| {
-            let Some(i) = numbers.next() else { return Ok(()) };
             let [w, h] = [sent.camera.intrinsics.width, sent.camera.intrinsics.height];
-            // Under other limits than those of its time a scene has other photos.
-            let same = |of: &&SceneCamera| {
+            // Under other limits than those of its time a scene has other photos, and some may
+            // have left it.
+            let same = |of: &SceneCamera| {
                 let k = of.camera.intrinsics;
                 of.file == sent.file && [k.width, k.height] == [w, h]
             };
-            let Some(_) = self.scene.meta.cameras.get(i).filter(same) else { return Ok(()) };
+            let Some(i) = self.scene.meta.cameras.iter().position(same) else { return Ok(()) };
             match sent.pixels {
                 SentPixels::File(bytes) => put(i, PhotoFile::Sent(bytes)),
                 SentPixels::Made(pixels) => put(i, PhotoFile::Png(png(pixels)?)),

@@ -559,6 +559,24 @@ pub(crate) fn form(upload: &Upload) -> reqwest::multipart::Form {
     })
 }
 
+/// Photos of a scene with a `transforms.json`, as the messages of `AddPhotos`.
+pub(crate) fn adding(upload: &Upload, scene_id: &str, key: &str) -> Vec<pb::AddPhotosRequest> {
+    use pb::{add_photos_header::Cameras, add_photos_request::Part};
+    let Some(UploadCameras::Transforms(json)) = &upload.cameras else { panic!("no transforms") };
+    let header = pb::AddPhotosHeader {
+        scene_id: scene_id.to_owned(),
+        cameras: Some(Cameras::TransformsJson(json.clone().into())),
+        wait_ms: Some(60_000),
+        idempotency_key: key.to_owned(),
+    };
+    let piece = |photo: &segsplat::scene::UploadFile| {
+        let (name, data) = (photo.name.clone(), photo.bytes.clone().into());
+        Part::Photo(pb::PhotoChunk { name, data })
+    };
+    let parts = std::iter::once(Part::Header(header)).chain(upload.photos.iter().map(piece));
+    parts.map(|part| pb::AddPhotosRequest { part: Some(part) }).collect()
+}
+
 /// An upload as the messages of `CreateScene`.
 pub(crate) fn messages(upload: &Upload, options: &Options) -> Vec<pb::CreateSceneRequest> {
     use pb::{create_scene_header::Cameras, create_scene_request::Part};

@@ -10,7 +10,7 @@ use std::{
 
 use segsplat::{
     models::{NetworkOptions, Runtime},
-    scene::Upload,
+    scene::{Upload, UploadCameras},
 };
 use serde_json::Value;
 
@@ -200,6 +200,19 @@ pub(crate) async fn create(
     answer(request.multipart(form(upload))).await
 }
 
+/// Some photos of an upload with a `transforms.json`, and their cameras.
+pub(crate) fn photos_of(upload: &Upload, photos: &[usize]) -> Upload {
+    let Some(UploadCameras::Transforms(json)) = &upload.cameras else { panic!("no transforms") };
+    let mut transforms: Value = serde_json::from_slice(json).expect("JSON");
+    let frames = transforms["frames"].as_array().expect("a list").clone();
+    transforms["frames"] = photos.iter().map(|&i| frames[i].clone()).collect();
+    Upload {
+        cameras: Some(UploadCameras::Transforms(transforms.to_string().into_bytes())),
+        photos: photos.iter().map(|&i| upload.photos[i].clone()).collect(),
+        ..Upload::default()
+    }
+}
+
 /// `POST` of JSON.
 pub(crate) async fn post(client: &reqwest::Client, url: &str, body: &Value) -> Answer {
     answer(client.post(url).json(body)).await
@@ -241,7 +254,7 @@ pub(crate) async fn eventually<T>(why: &str, mut what: impl AsyncFnMut() -> Opti
             return found;
         }
         assert!(begun.elapsed() < Duration::from_secs(60), "{why}: not within a minute");
-        tokio::time::sleep(Duration::from_millis(50)).await;
+        tokio::time::sleep(Duration::from_millis(10)).await;
     }
 }
 

@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from urllib.parse import quote
 from uuid import uuid4
 
 import numpy as np
@@ -334,14 +335,20 @@ def delete(scene: Handle) -> Flow[None]:
             yield from pause(scene.policy, error, again)
 
 
-def events(scene: Handle, tell: Callable[[Event], None] | None = None) -> Flow[None]:
+def events(
+    scene: Handle, tell: Callable[[Event], None] | None = None, *, semantics: bool = False
+) -> Flow[None]:
     """Items: what happens to the scene, from its present state to its last event. While it is
     refined, each better version is one more.
+
+    semantics: go on after the scene is made until its semantics are; the first text makes them.
     """
+    asked = {"semantics": True} if semantics else {}
     again = 0
     while True:
         try:
-            request = Request("GET", f"/v1/scenes/{scene.id}/events", stream=ServerSentEvents)
+            path = f"/v1/scenes/{scene.id}/events"
+            request = Request("GET", path, params=asked, stream=ServerSentEvents)
             yield from send(scene.policy, request)
             made = False
             while (data := (yield Read())) is not None:
@@ -394,6 +401,58 @@ def refine(scene: Handle, refine: Literal["auto", "off"] | int = "auto") -> Flow
     path = f"/v1/scenes/{scene.id}/refine"
     answer = yield from send(scene.policy, Request("POST", path, params={"refine": str(refine)}))
     scene.shown = parse(SceneStatus, _json(answer.body)), scene.shown[1]
+
+
+# Photos that join, or leave
+
+
+def add(
+    scene: Handle,
+    source: Source,
+    progress: Progress = None,
+    *,
+    masks: str | Path | None = None,
+    idempotency_key: str | None = None,
+) -> Flow[None]:
+    """Adds photos to a finished scene and waits until they have joined it; raises why they did not.
+    The version before is served meanwhile. Only the new photos go through the networks.
+
+    source: as a scene is made of: a folder or an archive of a capture, or photos and their cameras.
+        The poses are in the frame of the scene's own cameras (`scene.photos`).
+    progress: as `wait` takes it.
+    """
+    if not scene.policy.limits:
+        yield from meet(scene.policy)
+    request = Request(
+        "POST",
+        f"/v1/scenes/{scene.id}/photos",
+        upload=parts_of(source, scene.policy.limits) + masks_in(masks),
+        headers={"idempotency-key": idempotency_key or str(uuid4())},
+    )
+    yield from _changed(scene, request, progress)
+
+
+def remove(scene: Handle, photo: str | Photo, progress: Progress = None) -> Flow[None]:
+    """Takes a photo out of a finished scene and waits until the scene is without it. Its file stays
+    on the server until the scene is deleted.
+
+    photo: one of `scene.photos`, or its file name.
+    progress: as `wait` takes it.
+    """
+    name = quote(photo if isinstance(photo, str) else photo.file, safe="")
+    request = Request("DELETE", f"/v1/scenes/{scene.id}/photos/{name}")
+    yield from _changed(scene, request, progress)
+
+
+def _changed(scene: Handle, request: Request, progress: Progress) -> Flow[None]:
+    """Sends a change of the photos of a scene, and waits for the version with it."""
+    answer = yield from send(scene.policy, request)
+    scene.shown = parse(SceneStatus, _json(answer.body)), scene.shown[1]
+    yield from wait(scene, progress)
+    fault = scene.shown[0].growth.error
+    if fault:
+        kind = SegSplatError.of_code.get(fault.code, SegSplatError)
+        raise kind(fault.message, code=fault.code, scene=scene.id)
 
 
 # Edits

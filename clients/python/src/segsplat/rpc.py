@@ -16,6 +16,7 @@ from importlib import resources
 from itertools import chain
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import anyio
 import grpc
@@ -72,6 +73,8 @@ METHOD = _POOL.FindMessageTypeByName("segsplat.v1.Method").fields_by_name.keys()
 
 def messages(step: Request) -> tuple[MethodDescriptor, Message | Iterator[Message]]:
     """The method of a request of HTTP, and what is sent to it."""
+    if photos := re.fullmatch(r"/v1/scenes/(\w+)/photos(?:/(.+))?", step.path):
+        return _photos(step, *photos.groups())
     *_, scenes, id, action = ["", "", *step.path.removeprefix("/v1/").split("/")][-3:]
     edits = {"GET": "GetEdits", "PUT": "SetEdits"}.get(step.method) if action == "edits" else None
     if scenes != "scenes":
@@ -84,6 +87,18 @@ def messages(step: Request) -> tuple[MethodDescriptor, Message | Iterator[Messag
     if id:
         fields["scene_id"] = id
     return method, _message(method, _nested(method.name, fields))
+
+
+def _photos(
+    step: Request, id: str, name: str | None
+) -> tuple[MethodDescriptor, Message | Iterator[Message]]:
+    """Photos that join a scene, or the one of a name that leaves it."""
+    fields: dict[str, Any] = {"scene_id": id, **step.params}
+    if name is not None:
+        method = _SERVICE.methods_by_name["RemovePhoto"]
+        return method, _message(method, {**fields, "name": unquote(name)})
+    method = _SERVICE.methods_by_name["AddPhotos"]
+    return method, _upload(method, step, fields)
 
 
 def _message(method: MethodDescriptor, fields: Mapping[str, Any]) -> Message:
@@ -109,9 +124,11 @@ def _upload(
     if "refine" in header:
         header["refine"] = str(header["refine"])
     header["idempotency_key"] = step.headers["idempotency-key"]
+    if how:
+        header["method"] = how
     described = [part for part in step.upload if part.field in ("transforms", "cameras")]
     header |= {f"{part.field}_json": b"".join(_pieces(part)) for part in described}
-    yield _message(method, {"header": {**header, "method": how}})
+    yield _message(method, {"header": header})
     for part in step.upload:
         name = part.name
         for data in () if part in described else _pieces(part):

@@ -469,6 +469,21 @@ class Refinement:
 
 
 @dataclass(frozen=True)
+class Growth:
+    """How far photos are that join a scene, or leave it."""
+
+    state: Literal["none", "running", "done", "failed"] = "none"
+    #: Calls whose photos are not in the served version yet.
+    waiting: int = 0
+    #: Stage at work while running.
+    stage: str | None = None
+    #: Share of that work that is done, 0 to 1.
+    fraction: float = 0.0
+    #: Why the last one was given up; the scene is served as it was.
+    error: SceneFault | None = None
+
+
+@dataclass(frozen=True)
 class SceneStatus:
     """A scene at one moment."""
 
@@ -486,9 +501,10 @@ class SceneStatus:
     error: SceneFault | None = None
     report: Report | None = None
     #: Counts what was served under this id: 0 until it is done, then 1, and one more with each
-    #: better version that refinement publishes.
+    #: better version that refinement publishes, and with each change of its photos.
     version: int = 0
     refinement: Refinement = Refinement()
+    growth: Growth = Growth()
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 //! Edits of a scene: delete, keep, move, copy and recolour some of its Gaussians.
 //!
-//! An [`Edit`] says what it takes by the entries of the bank and by places in the world, never by
-//! numbers of Gaussians. So a list of edits fits every version of a scene. Edits are applied one
-//! after the other: each takes what those before it left, and entries move and are copied with
-//! their Gaussians.
+//! An [`Edit`] says what it takes by the entries of the bank and by places in the world, so a list
+//! of edits fits every version of a scene. Only where a network found a text in the photos it is
+//! numbers of Gaussians, which fit one version. Edits are applied one after the other: each takes
+//! what those before it left, and entries and numbers move and are copied with their Gaussians.
 
 use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
@@ -51,19 +51,28 @@ impl Place {
     }
 }
 
-/// Which Gaussians an edit takes: those that fit both fields.
+/// Which Gaussians an edit takes: those that fit all fields.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Selected {
     /// Entries of the bank, ascending; `None`: all Gaussians, with or without an entry.
     pub entries: Option<Vec<u16>>,
+    /// Numbers that Gaussians have before all edits, runs `[first, count]`, ascending; `None`: all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub numbers: Option<Vec<[u32; 2]>>,
     /// Places of their centres, one of which is enough; empty: everywhere.
     pub within: Vec<Place>,
 }
 
 impl Selected {
-    fn takes(&self, point: DVec3, entry: u16) -> bool {
+    fn takes(&self, point: DVec3, entry: u16, number: u32) -> bool {
         let by_entry = self.entries.as_ref().is_none_or(|all| all.binary_search(&entry).is_ok());
-        by_entry && (self.within.is_empty() || self.within.iter().any(|place| place.holds(point)))
+        let by_number = self.numbers.as_ref().is_none_or(|runs| {
+            let after = runs.partition_point(|[first, _]| *first <= number);
+            after > 0 && number - runs[after - 1][0] < runs[after - 1][1]
+        });
+        by_entry
+            && by_number
+            && (self.within.is_empty() || self.within.iter().any(|place| place.holds(point)))
     }
 }
 
@@ -141,6 +150,8 @@ pub fn edited(edits: &[Edit], gaussians: &Gaussians, most: usize) -> Result<Edit
 pub struct Editing {
     whole: Gaussians,
     raw: RawGaussians,
+    /// `[N]` number that each, or what it is a copy of, had before all edits.
+    numbers: Vec<u32>,
     /// `[N]` whether each is still there.
     there: Vec<bool>,
     /// Whether any number of any Gaussian is another one.
@@ -154,7 +165,8 @@ impl Editing {
     pub fn new(gaussians: &Gaussians, most: usize) -> Self {
         let raw = gaussians.clone().into_raw();
         let there = vec![true; raw.means.len()];
-        Self { whole: gaussians.clone(), raw, there, changed: false, most }
+        let numbers = (0..).take(raw.means.len()).collect();
+        Self { whole: gaussians.clone(), raw, numbers, there, changed: false, most }
     }
 
     /// Applies an edit; gives how many Gaussians it took.
@@ -177,6 +189,9 @@ impl Editing {
                     let what = format!("a copy of {count} Gaussians makes {after} of the scene");
                     return Err(Error::limit("edits", what, self.most));
                 }
+                let numbers = self.numbers.iter().zip(&taken).filter(|(_, taken)| **taken);
+                let numbers: Vec<u32> = numbers.map(|(number, _)| *number).collect();
+                self.numbers.extend(numbers);
                 let copies = self.raw.only(|i| taken[i]);
                 let first = self.raw.means.len();
                 self.raw.append(copies);
@@ -214,10 +229,18 @@ impl Editing {
             .map_err(|e| Error::internal("the edits give bad Gaussians").caused_by(e))
     }
 
+    /// The number that each Gaussian which is there now had before all edits.
+    #[must_use]
+    pub fn numbers(&self) -> Vec<u32> {
+        let there = self.numbers.iter().zip(&self.there).filter(|(_, there)| **there);
+        there.map(|(number, _)| *number).collect()
+    }
+
     fn taken(&self, of: &Selected) -> Vec<bool> {
         let (raw, there) = (&self.raw, &self.there);
         let takes = |(i, mean): (usize, &[f32; 3])| {
-            there[i] && of.takes(world(raw.origin, *mean), raw.semantic_index[i])
+            let point = world(raw.origin, *mean);
+            there[i] && of.takes(point, raw.semantic_index[i], self.numbers[i])
         };
         raw.means.par_iter().enumerate().with_min_len(1 << 12).map(takes).collect()
     }
@@ -296,11 +319,11 @@ mod tests {
     }
 
     fn of_entry(entry: u16) -> Selected {
-        Selected { entries: Some(vec![entry]), within: Vec::new() }
+        Selected { entries: Some(vec![entry]), ..Selected::default() }
     }
 
     fn within(place: Place) -> Selected {
-        Selected { entries: None, within: vec![place] }
+        Selected { within: vec![place], ..Selected::default() }
     }
 
     fn one(action: EditAction, of: Selected, gaussians: &Gaussians) -> Edited {
@@ -393,6 +416,24 @@ mod tests {
         assert_eq!((both.gaussians.len(), &*both.counts), (3, &[2, 4][..]), "the copy goes too");
         let refused = edited(&[copy], &whole, 6).unwrap_err();
         assert!(refused.message().contains('7') && refused.message().contains('6'), "{refused}");
+    }
+
+    #[test]
+    fn numbers_are_those_before_all_edits_and_copies_keep_them() {
+        let whole = row(9);
+        let numbers =
+            |runs: &[[u32; 2]]| Selected { numbers: Some(runs.to_vec()), ..Selected::default() };
+        let one = |action, of| Edit { action, of };
+        let placement = Placement { translation: [0.0, 7.0, 0.0], ..Placement::default() };
+        let edits = [
+            one(EditAction::Delete, numbers(&[[0, 2], [5, 1]])),
+            one(EditAction::Copy(placement), numbers(&[[1, 2], [8, 1]])),
+            one(EditAction::Delete, numbers(&[[4, 2], [8, 3]])),
+        ];
+        let edited = edited(&edits, &whole, 20).unwrap();
+        assert_eq!(edited.counts, [3, 2, 3], "1 is gone; 4, 8 and the copy of 8");
+        let left: Vec<f32> = edited.gaussians.means().iter().map(|mean| mean[0]).collect();
+        assert_eq!(left, [2.0, 3.0, 6.0, 7.0, 2.0]);
     }
 
     #[test]

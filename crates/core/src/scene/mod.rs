@@ -12,6 +12,7 @@ mod failure;
 mod finished;
 mod gaussians;
 mod geometry;
+mod growth;
 mod id;
 mod method;
 mod photo;
@@ -36,6 +37,7 @@ pub use failure::SceneError;
 pub use finished::{PhotoHash, Provenance, Scene, SceneMeta};
 pub use gaussians::{BLUR_PX2, Gaussians, RawGaussians, SH_C0, SanitizeReport, SourcePixel};
 pub use geometry::ViewGaussians;
+pub use growth::{GrowthState, GrowthStatus};
 pub use id::{SCENE_ID_CHARS, SceneId};
 pub use method::{
     Density, MaskLevel, Method, Preset, SceneOptions, ScoringMethod, SemanticsMode, with_pairs,

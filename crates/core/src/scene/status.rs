@@ -7,8 +7,8 @@ use utoipa::ToSchema;
 use crate::{
     names::display_names,
     scene::{
-        Camera, HealthReport, Intrinsics, RefineState, RefineStatus, SceneError, SceneId,
-        SemanticsReport, principal_axes,
+        Camera, GrowthState, GrowthStatus, HealthReport, Intrinsics, RefineState, RefineStatus,
+        SceneError, SceneId, SemanticsReport, principal_axes,
     },
 };
 
@@ -178,7 +178,8 @@ pub struct SceneStatus {
     #[schema(required = true)]
     pub semantics: SemanticsStatus,
     /// Counts what was served under this id: 0 until it is done, then 1, and one more with each
-    /// better version that refinement publishes. Tags of views change with it.
+    /// better version that refinement publishes, and with each change of its photos. Tags of views
+    /// change with it.
     #[serde(default)]
     #[schema(required = true)]
     pub version: u32,
@@ -186,6 +187,10 @@ pub struct SceneStatus {
     #[serde(default)]
     #[schema(required = true)]
     pub refinement: RefineStatus,
+    /// How far photos are that joined it or left it after it was made.
+    #[serde(default)]
+    #[schema(required = true)]
+    pub growth: GrowthStatus,
 }
 
 impl SceneStatus {
@@ -204,6 +209,7 @@ impl SceneStatus {
             semantics: SemanticsStatus::default(),
             version: 0,
             refinement: RefineStatus::default(),
+            growth: GrowthStatus::default(),
         }
     }
 
@@ -212,10 +218,17 @@ impl SceneStatus {
         self.refinement.state == RefineState::Running
     }
 
-    /// Whether nothing happens to it now: neither it nor its semantics are being made. It may be
-    /// refined.
+    /// Whether photos wait to join it or to leave it, or do so now.
+    pub fn is_growing(&self) -> bool {
+        self.growth.state == GrowthState::Running
+    }
+
+    /// Whether nothing happens to it now: neither it nor its semantics are being made, and its
+    /// photos stay as they are. It may be refined.
     pub fn is_settled(&self) -> bool {
-        self.state.is_final() && self.semantics.state != SemanticsState::Running
+        self.state.is_final()
+            && self.semantics.state != SemanticsState::Running
+            && !self.is_growing()
     }
 }
 

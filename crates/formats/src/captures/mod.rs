@@ -440,7 +440,10 @@ fn chosen(
     let pose =
         |(i, (entry, _)): (usize, &Pair)| entries[*entry].pose(&label(i, &entries[*entry].file));
     let poses: Vec<CameraToWorld> = pairs.iter().enumerate().map(pose).collect::<Result<_>>()?;
-    check_places(&poses)?;
+    // Photos that join others may stand anywhere.
+    if limits.photos_min > 1 {
+        check_places(&poses)?;
+    }
     let scaled: Vec<&CameraEntry> =
         pairs.iter().map(|(entry, _)| &entries[*entry]).filter(|e| e.scale().is_some()).collect();
     let scale = scaled.first().and_then(|entry| entry.scale()).unwrap_or(1.0);

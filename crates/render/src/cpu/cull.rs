@@ -41,14 +41,17 @@ pub enum Shown {
 impl Shown {
     /// Those of the blocks that `frustum` shows.
     pub fn of(blocks: &Blocks, frustum: &Frustum) -> Self {
-        let all = (0..blocks.bounds.len()).into_par_iter().with_min_len(1 << 9);
-        let seen: Vec<usize> = all.filter(|&at| blocks.is_shown(at, frustum)).collect();
-        if seen.len() == blocks.own && seen.last().is_none_or(|&at| at < blocks.own) {
+        let seen = blocks.shown(frustum);
+        if seen.len() == blocks.own && seen.last().is_none_or(|&at| (at as usize) < blocks.own) {
             return Self::All;
         }
-        let merged = blocks.merged.clone();
+        Self::Some { ids: Self::ids_of(blocks, &seen), merged: blocks.merged.clone() }
+    }
+
+    /// The Gaussians of some blocks, ascending.
+    pub(crate) fn ids_of(blocks: &Blocks, seen: &[u32]) -> Vec<u32> {
         if seen.is_empty() {
-            return Self::Some { ids: Vec::new(), merged };
+            return Vec::new();
         }
         // A bit for each Gaussian.
         let bits: Vec<AtomicU64> = (0..blocks.order.len().div_ceil(64))
@@ -58,7 +61,7 @@ impl Shown {
             .collect();
         seen.par_iter().with_min_len(16).for_each(|&at| {
             // Neighbours share a word.
-            for run in blocks.ids(at).chunk_by(|a, b| a / 64 == b / 64) {
+            for run in blocks.ids(at as usize).chunk_by(|a, b| a / 64 == b / 64) {
                 let word = run.iter().fold(0, |word, id| word | 1 << (id % 64));
                 bits[run[0] as usize / 64].fetch_or(word, Ordering::Relaxed);
             }
@@ -75,7 +78,7 @@ impl Shown {
             ids
         });
         let parts: Vec<Vec<u32>> = ids.collect();
-        Self::Some { ids: parts.concat(), merged }
+        parts.concat()
     }
 
     /// Number of them, in a scene of `count`.
@@ -118,8 +121,17 @@ impl Shown {
         }
     }
 
+    /// Opacities that the one at place `at` stands for, in sum; 0 if it is of the scene.
+    #[inline(always)]
+    pub(super) fn sum(&self, gaussians: &Gaussians, at: usize) -> f64 {
+        match (self.merged(), self.id(at).checked_sub(gaussians.len())) {
+            (Some(merged), Some(id)) => f64::from(merged.sums[id]),
+            _ => 0.0,
+        }
+    }
+
     /// Their entries of the bank.
-    pub(super) fn entries<'a>(&self, gaussians: &'a Gaussians) -> Cow<'a, [u16]> {
+    pub(crate) fn entries<'a>(&self, gaussians: &'a Gaussians) -> Cow<'a, [u16]> {
         let own = gaussians.semantic_index();
         let Self::Some { ids, merged } = self else { return Cow::Borrowed(own) };
         let merged = merged.as_ref().map(|merged| merged.entries(gaussians));

@@ -42,6 +42,7 @@ use super::{
     Frame, Labels, RenderRequest,
     backward::{FrameGradients, Gradients, backward_request},
     blocks::{BlockCache, Blocks, Frustum, blocks_from},
+    budget::Budget,
     constants::{ISECTS_MAX, TILE_SIZE},
     labels::WeightRows,
     renderer::{DeviceTimes, DifferentiableRenderer, DispatchTime, Renderer},
@@ -157,7 +158,8 @@ impl CpuRenderer {
         clock.ended("project");
         let mut brightest = 0.0;
         if request.kinds.color {
-            brightest = shade::shade(gaussians, &view, options, &mut scratch.projected);
+            let bounded = Budget::of(request).rays > 0.0;
+            brightest = shade::shade(gaussians, &view, options, bounded, &mut scratch.projected);
             clock.ended("shade");
         }
         let seen = scratch.projected.tiles_per_gauss.par_iter().with_min_len(1 << 14);

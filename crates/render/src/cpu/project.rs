@@ -4,6 +4,8 @@
 //! dropped Gaussian touches no tile (`tiles_per_gauss` is 0). All arithmetic is f64; the results
 //! become f32 at the end.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use super::{
@@ -15,7 +17,6 @@ use super::{
 use crate::{
     RenderRequest, Source,
     constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK, OWN_SIZE, PIXEL_PX2},
-    merged::Merged,
     scene::Gaussians,
     view::View,
 };
@@ -78,7 +79,11 @@ impl LaneKernel for Chunk<'_> {
     fn run<S: Lanes>(self, simd: S) {
         let Self { request, view, options, out: (footprints, spans, tiles), .. } = self;
         let magnifies = !request.sources.is_empty();
-        let merged = self.shown.merged();
+        let block_options = BlockOptions {
+            antialiased: request.antialiased,
+            magnifies,
+            merged: self.shown.merged().is_some(),
+        };
         let grid = Grid::whole(view, options);
         let out = footprints.chunks_mut(BLOCK).zip(spans.chunks_mut(BLOCK));
         let out = out.zip(tiles.chunks_mut(BLOCK)).enumerate();
@@ -86,18 +91,12 @@ impl LaneKernel for Chunk<'_> {
         for (at, ((footprints, spans), tiles)) in out {
             tiles.fill(0);
             let first = self.first + at * BLOCK;
-            let ids = &mut [0; BLOCK][..footprints.len()];
-            (first..).zip(&mut *ids).for_each(|(at, id)| *id = self.shown.id(at));
-            block.load(self.gaussians, ids, merged);
+            let places = first..first + footprints.len();
+            block.load(self.gaussians, self.shown, places.clone());
             if magnifies {
-                block.load_widths(self.gaussians, ids, merged, &request.sources);
+                block.load_widths(self.gaussians, self.shown, places, &request.sources);
             }
-            let options = BlockOptions {
-                antialiased: request.antialiased,
-                magnifies,
-                merged: merged.is_some(),
-            };
-            if !block.project(simd, view, options) {
+            if !block.project(simd, view, block_options) {
                 continue;
             }
             let mut seen = 0_u32;
@@ -137,7 +136,7 @@ struct Block {
     /// Width of the source pixel in the world; 0 where it is not known.
     width: Row,
     opacity: Row,
-    /// Opacities that it stands for, in sum; 0 of a Gaussian of the scene.
+    /// Opacities that it stands for, in sum; 0 of a Gaussian of the scene. Loaded if any is merged.
     sum: Row,
     center: [Row; 2],
     conic_shear: Row,
@@ -149,50 +148,54 @@ struct Block {
 }
 
 impl Block {
+    /// Loads the Gaussians at these places of those shown.
     #[inline(always)]
-    fn load(&mut self, gaussians: &Gaussians, ids: &[usize], merged: Option<&Merged>) {
-        for (k, &id) in ids.iter().enumerate() {
-            match merged.and_then(|merged| Some((merged, id.checked_sub(gaussians.len())?))) {
-                None => {
-                    self.set(k, gaussians, id);
-                    self.sum[k] = 0.0;
-                }
-                Some((merged, id)) => {
-                    self.set(k, &merged.gaussians, id);
-                    self.sum[k] = f64::from(merged.sums[id]);
-                }
+    fn load(&mut self, gaussians: &Gaussians, shown: &Shown, places: Range<usize>) {
+        if let Shown::All = shown {
+            // They lie side by side.
+            let rows = gaussians.means()[places.clone()].iter();
+            let rows = rows.zip(&gaussians.quats()[places.clone()]);
+            let rows = rows.zip(&gaussians.scales()[places.clone()]);
+            let rows = rows.zip(&gaussians.opacities()[places]);
+            for (k, (((mean, quat), scale), &opacity)) in rows.enumerate() {
+                self.set(k, mean, quat, scale, opacity);
             }
+            return;
+        }
+        for (k, at) in places.enumerate() {
+            let (of, id) = shown.find(gaussians, at);
+            let (mean, quat, scale) = (&of.means()[id], &of.quats()[id], &of.scales()[id]);
+            self.set(k, mean, quat, scale, of.opacities()[id]);
+            self.sum[k] = shown.sum(gaussians, at);
         }
     }
 
     #[inline(always)]
-    fn set(&mut self, k: usize, gaussians: &Gaussians, id: usize) {
-        for (row, value) in self.mean.iter_mut().zip(gaussians.means()[id]) {
+    fn set(&mut self, k: usize, mean: &[f32; 3], quat: &[f32; 4], scale: &[f32; 3], opacity: f32) {
+        for (row, &value) in self.mean.iter_mut().zip(mean) {
             row[k] = f64::from(value);
         }
-        for (row, value) in self.scale.iter_mut().zip(gaussians.scales()[id]) {
+        for (row, &value) in self.quat.iter_mut().zip(quat) {
             row[k] = f64::from(value);
         }
-        for (row, value) in self.quat.iter_mut().zip(gaussians.quats()[id]) {
+        for (row, &value) in self.scale.iter_mut().zip(scale) {
             row[k] = f64::from(value);
         }
-        self.opacity[k] = f64::from(gaussians.opacities()[id]);
+        self.opacity[k] = f64::from(opacity);
     }
 
     #[inline(always)]
     fn load_widths(
         &mut self,
         gaussians: &Gaussians,
-        ids: &[usize],
-        merged: Option<&Merged>,
+        shown: &Shown,
+        places: Range<usize>,
         sources: &[Source],
     ) {
-        for (k, &id) in ids.iter().enumerate() {
+        for (k, at) in places.enumerate() {
             self.width[k] = 0.0;
-            let of_merged = || Some(merged?.gaussians.source()[id - gaussians.len()]);
-            let source = gaussians.source().get(id).copied().or_else(of_merged);
-            let source = source.and_then(|source| sources.get(usize::from(source.view)));
-            if let Some(source) = source {
+            let (of, id) = shown.find(gaussians, at);
+            if let Some(source) = sources.get(usize::from(of.source()[id].view)) {
                 let mut depth = 0.0;
                 for (axis, mean) in self.mean.iter().enumerate() {
                     let from = mean[k] - f64::from(source.center[axis]);
@@ -207,7 +210,7 @@ impl Block {
     #[inline(always)]
     fn project<S: Lanes>(&mut self, simd: S, view: &View, options: BlockOptions) -> bool {
         let BlockOptions { antialiased, magnifies, merged } = options;
-        let mut any = false;
+        let mut any_kept = false;
         self.kept = [0.0; BLOCK];
         // No `map` of arrays from here on: what it calls is not compiled for the processor.
         let number = |value: f64| Wide::of(simd, value);
@@ -230,10 +233,10 @@ impl Block {
                 dot(w[2], mean) + moved[2],
             ];
             let kept = t[2].at_least(number(view.near));
-            if simd.first_true_m64s(kept) == S::F64_LANES {
+            if !any(simd, kept) {
                 continue;
             }
-            any = true;
+            any_kept = true;
             let per_z = number(1.0) / t[2];
             let slope = [t[0] * per_z, t[1] * per_z];
             let bounded = [
@@ -243,25 +246,32 @@ impl Block {
             // Rows of M = J W R diag(scales), so that the 2D covariance is M Mᵀ.
             let quat = [at(&self.quat[0]), at(&self.quat[1]), at(&self.quat[2]), at(&self.quat[3])];
             let columns = rotation(number(1.0), number(2.0), quat);
-            // What the blur lost or has too much: see `plan`.
-            let (mut lost, mut learnt, mut drawn) = (number(0.0), blur, blur);
+            // What the blur lost or has too much: see `plan`. Neighbours are alike, so most vectors
+            // need neither of the two, which then would change no bit.
+            let (mut lost, mut learnt, mut drawn) = (None, blur, blur);
+            let mut filtered = false;
             if magnifies {
                 let width = at(&self.width);
                 let p = width * number(larger_focal) * per_z;
-                let share = (number(1.0) - number(1.0) / (p * p)).only(p.at_least(number(1.0)));
-                lost = blur * width * width * share;
+                let larger = p.at_least(number(1.0));
+                if any(simd, larger) {
+                    let share = (number(1.0) - number(1.0) / (p * p)).only(larger);
+                    lost = Some(blur * width * width * share);
+                }
                 let size = (p * number(f64::from(OWN_SIZE).powi(2))).min(number(1.0));
-                let smaller = number(1.0) - size * size;
-                // The antialiased mode has a rule of its own.
                 let known = width.at_least(number(f64::MIN_POSITIVE));
-                let smaller = if antialiased { number(0.0) } else { smaller.only(known) };
-                learnt = blur * (number(1.0) - smaller);
-                drawn = learnt + number(f64::from(PIXEL_PX2)) * smaller;
+                let smaller = (number(1.0) - size * size).only(known);
+                // The antialiased mode has a rule of its own.
+                filtered = !antialiased && any(simd, smaller.at_least(number(f64::MIN_POSITIVE)));
+                if filtered {
+                    learnt = blur * (number(1.0) - smaller);
+                    drawn = learnt + number(f64::from(PIXEL_PX2)) * smaller;
+                }
             }
             let mut local = w;
             for (k, column) in columns.into_iter().enumerate() {
                 let mut scale = at(&self.scale[k]);
-                if magnifies {
+                if let Some(lost) = lost {
                     scale = scale.times_plus(scale, lost).sqrt();
                 }
                 for row in 0..3 {
@@ -282,8 +292,8 @@ impl Block {
             let det = det_sharp + drawn * (xx + yy) + drawn * drawn;
             let var_y = yy + drawn;
             let half = number(0.5);
-            let stands = at(&self.sum).at_least(number(f64::MIN_POSITIVE));
             if merged && !antialiased {
+                let stands = at(&self.sum).at_least(number(f64::MIN_POSITIVE));
                 // What its members cover with the blur that they were learnt with (`merged`).
                 let det_learnt = det_sharp + learnt * (xx + yy) + learnt * learnt;
                 let opacity = at(&self.opacity);
@@ -296,7 +306,7 @@ impl Block {
             if antialiased {
                 let share = (det_sharp / det).sqrt();
                 (at(&self.opacity) * share).put(&mut self.opacity, i);
-            } else if magnifies {
+            } else if filtered {
                 // Its sum over the picture stays, less what is under the least alpha.
                 let det_learnt = det_sharp + learnt * (xx + yy) + learnt * learnt;
                 let opacity = at(&self.opacity);
@@ -305,6 +315,7 @@ impl Block {
                 (opacity - gone).put(&mut self.opacity, i);
             }
             if merged {
+                let stands = at(&self.sum).at_least(number(f64::MIN_POSITIVE));
                 let opacity = at(&self.opacity);
                 let most = opacity.min(opacity.sqrt());
                 (opacity + (most - opacity).only(stands)).put(&mut self.opacity, i);
@@ -319,7 +330,7 @@ impl Block {
             t[2].put(&mut self.depth, i);
             number(1.0).only(kept).put(&mut self.kept, i);
         }
-        any
+        any_kept
     }
 
     /// The footprint of Gaussian `k`; `None` if it is not visible.
@@ -349,6 +360,12 @@ impl Block {
         let wide = |inv: f32| inv > 0.0 && inv.is_finite();
         (finite && wide(footprint.conic_x) && wide(footprint.conic_y)).then_some(footprint)
     }
+}
+
+/// Whether any lane of the mask is set.
+#[inline(always)]
+fn any<S: Lanes>(simd: S, mask: S::m64s) -> bool {
+    simd.first_true_m64s(mask) < S::F64_LANES
 }
 
 /// Columns of the rotation of a quaternion of any length, wxyz.

@@ -329,10 +329,11 @@ fn blend_cell<S: Lanes, const K: usize, const WEIGHTS: bool>(
             let counts = simd.less_than_or_equal_f32s(simd.splat_f32s(ALPHA_MIN), alpha);
             let alpha = simd.select_f32s(counts, alpha, zero);
             let next = simd.mul_f32s(transmittance, simd.sub_f32s(simd.splat_f32s(1.0), alpha));
-            // The Gaussian that would end the ray is not added; an ended ray stays at 0.
+            // The Gaussian that would end the ray is not added, and none after it: no factor is
+            // over 1. So the next product need not wait for this comparison.
             let lives = simd.greater_than_f32s(next, end);
             let weight = simd.select_f32s(lives, simd.mul_f32s(alpha, transmittance), zero);
-            transmittance = simd.select_f32s(lives, next, zero);
+            transmittance = next;
             alpha_sum = simd.add_f32s(alpha_sum, weight);
             for (sum, &value) in channels.iter_mut().zip(&gaussian.channels) {
                 *sum = simd.fused(weight, simd.splat_f32s(value), *sum);
@@ -345,13 +346,23 @@ fn blend_cell<S: Lanes, const K: usize, const WEIGHTS: bool>(
                 break 'all;
             }
         }
+        // Before a product is too small for f32.
+        transmittance = left(simd, transmittance);
     }
+    let transmittance = left(simd, transmittance);
     cell.transmittance.put(simd, i, transmittance);
     cell.alpha.put(simd, i, alpha_sum);
     for (channel, sum) in channels.into_iter().zip(&mut cell.channels) {
         sum.put(simd, i, channel);
     }
     goes_on
+}
+
+/// These transmittances, 0 of rays that have ended.
+#[inline(always)]
+fn left<S: Lanes>(simd: S, transmittance: S::f32s) -> S::f32s {
+    let lives = simd.greater_than_f32s(transmittance, simd.splat_f32s(TRANSMITTANCE_MIN));
+    simd.select_f32s(lives, transmittance, simd.splat_f32s(0.0))
 }
 
 #[cfg(test)]

@@ -18,11 +18,13 @@ const CHUNK: usize = 1024;
 
 /// Writes the colour of every visible footprint, in place. The footprints keep the order of the
 /// scene, which suits the rasteriser's cache better than depth order. A scene of degree 0 looks the
-/// same from everywhere, so no direction is computed. Returns the largest number of a colour.
+/// same from everywhere, so no direction is computed. Returns the largest number of a colour if
+/// that is to be `bounded`, else 0.
 pub fn shade(
     gaussians: &Gaussians,
     view: &View,
     options: KernelOptions,
+    bounded: bool,
     projected: &mut Projected,
 ) -> f32 {
     let flat = gaussians.sh_count() == 1 && options.skips(Skip::FlatColor);
@@ -42,7 +44,10 @@ pub fn shade(
                     let mean = DVec3::from(gaussians.means()[i].map(f64::from));
                     color(sh, mean - view.center)
                 };
-                brightest = footprint.color.into_iter().fold(brightest, f32::max);
+                // It waits for what was written, so it is left out where it can be.
+                if bounded {
+                    brightest = footprint.color.into_iter().fold(brightest, f32::max);
+                }
             }
         }
         brightest

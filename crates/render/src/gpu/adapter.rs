@@ -28,6 +28,7 @@ use crate::{
     renderer::{DeviceTimes, DispatchTime},
     scene::Gaussians,
     train::TrainingSet,
+    view::View,
 };
 
 /// How often one submission is tried on a new device before its views fail.
@@ -166,7 +167,8 @@ impl Adapter {
     pub(super) fn prepare(&self, gaussians: &Gaussians) -> Result<()> {
         // The next view opens a device that was lost.
         let Some(on) = self.state.lock().opened.clone() else { return Ok(()) };
-        if self.holds(gaussians.shape_identity()) {
+        let pages = on.scenes.lock().pages(&on.gpu, gaussians, false);
+        if pages || self.holds(gaussians.shape_identity()) {
             return Ok(());
         }
         let scene = DeviceScene::for_views(&on.gpu, gaussians, self.blocks_from(), false)?;
@@ -280,6 +282,9 @@ impl Adapter {
     ) -> Result<Vec<Option<Frame>>> {
         let labelled = requests.first().is_some_and(|one| one.labels != Labels::None);
         let detailed = requests.iter().any(|request| request.detail > 0.0);
+        if context.pages(gaussians, detailed) {
+            return Ok(requests.iter().map(|_| None).collect());
+        }
         let scene = context.scene(gaussians, labelled, detailed)?;
         let start = |request: &&'a RenderRequest| Drawing::new(gaussians.origin(), request, &scene);
         let mut drawings = requests.iter().map(start).collect::<Result<Vec<_>>>()?;
@@ -291,20 +296,38 @@ impl Adapter {
         frames.collect()
     }
 
-    /// One frame; `marks` has the times of its last submission.
+    /// One frame; `marks` has the times of its last submission. Where the device cannot hold what
+    /// the view shows, its rows of tiles are halved.
     fn one(
         &self,
         context: &mut Context,
         gaussians: &Gaussians,
         request: &RenderRequest,
-        marks: Option<&mut Marks>,
+        mut marks: Option<&mut Marks>,
     ) -> Result<Frame> {
-        let labelled = request.labels != Labels::None;
-        let scene = context.scene(gaussians, labelled, request.detail > 0.0)?;
-        let mut tools = context.tools(&scene, self.isects_max(), marks);
-        let mut drawing = Drawing::new(gaussians.origin(), request, &scene)?;
-        let rows = drawing.whole();
-        tools.rows(&mut drawing, rows)?;
+        let view = View::new(gaussians.origin(), request)?;
+        let mut drawn: Option<Drawing<'_>> = None;
+        // The topmost last.
+        let mut left = Vec::from_iter(Some(0..view.tiles_y()));
+        while let Some(rows) = left.pop() {
+            let scene = match context.shown(gaussians, request, &view.band(&rows)) {
+                Err(error) if error.code() == ErrorCode::LimitExceeded && rows.len() > 1 => {
+                    let middle = rows.start.midpoint(rows.end);
+                    left.extend([middle..rows.end, rows.start..middle]);
+                    continue;
+                }
+                other => other?,
+            };
+            let mut drawing = match drawn.take() {
+                Some(drawing) => drawing,
+                None => Drawing::new(gaussians.origin(), request, &scene)?,
+            };
+            drawing.draws(&scene);
+            let mut tools = context.tools(&scene, self.isects_max(), marks.as_deref_mut());
+            tools.rows(&mut drawing, rows)?;
+            drawn = Some(drawing);
+        }
+        let drawing = drawn.ok_or_else(|| Error::internal("a picture without rows"))?;
         drawing.finish(&mut context.scratch)
     }
 

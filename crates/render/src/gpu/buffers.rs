@@ -13,7 +13,7 @@ use super::{
 };
 use crate::{
     Background, Labels, RenderRequest, Samples, Source,
-    blocks::{Blocks, Bounds, Frustum},
+    blocks::{BlockCache, Blocks, Bounds, Frustum},
     budget::{Budget, RayEnd, brightest},
     constants::{HALF_LEVEL, OWN_SIZE, TRANSMITTANCE_MIN},
     error::{Error, ErrorCode, Result},
@@ -286,6 +286,8 @@ pub(super) struct DeviceScene {
     merged: Option<Arc<Merged>>,
     /// Uploaded when a request first asks for labels.
     pub(super) labels: Option<DeviceLabels>,
+    /// The blocks of the scene that it has, ascending, where it has not all.
+    pub(super) part: Option<Arc<[u32]>>,
 }
 
 /// The blocks of a scene on the device.
@@ -320,17 +322,15 @@ pub(super) struct DeviceLabels {
 }
 
 impl DeviceLabels {
-    fn upload(gpu: &Gpu, source: &Gaussians, merged: Option<&Merged>) -> Result<Self> {
-        let entries = source.semantic_index();
+    /// Uploads entries of Gaussians of the scene of that [`Gaussians::identity`].
+    pub(super) fn upload(gpu: &Gpu, identity: u64, mut entries: Vec<u16>) -> Result<Self> {
         let mut seen = vec![false; 1 << u16::BITS];
         entries.iter().for_each(|&entry| seen[usize::from(entry)] = true);
         let distinct = seen[1..].iter().filter(|seen| **seen).count() as u32;
         // Uploads are whole words.
-        let mut padded = entries.to_vec();
-        padded.extend(merged.iter().flat_map(|merged| merged.entries(source).to_vec()));
-        padded.resize(padded.len().next_multiple_of(2), 0);
-        let entries = gpu.upload("bank entries", &[bytemuck::cast_slice(&padded)], None)?;
-        Ok(Self { identity: source.identity(), entries, distinct })
+        entries.resize(entries.len().next_multiple_of(2), 0);
+        let entries = gpu.upload("bank entries", &[bytemuck::cast_slice(&entries)], None)?;
+        Ok(Self { identity, entries, distinct })
     }
 }
 
@@ -340,10 +340,20 @@ impl DeviceScene {
         self.shape == shape
     }
 
+    /// Whether its entries are those of `source`.
+    pub(super) fn has_labels_of(&self, source: &Gaussians) -> bool {
+        self.labels.as_ref().is_some_and(|labels| labels.identity == source.identity())
+    }
+
     fn size_bytes(&self) -> u64 {
         let labels = self.labels.as_ref().map_or(0, |labels| labels.entries.size());
         let blocks = self.blocks.as_ref().map_or(0, |blocks| blocks.order.size());
         self.gaussians.size() + self.sh.size() + labels + blocks
+    }
+
+    /// Whether it has all Gaussians; if `detailed`, with merged ones where it has blocks.
+    fn is_whole(&self, detailed: bool) -> bool {
+        self.part.is_none() && (!detailed || self.blocks.is_none() || self.merged.is_some())
     }
 
     /// Number of its blocks; 0 if it has none.
@@ -366,7 +376,9 @@ impl DeviceScene {
         let blocks = if detailed { Blocks::detailed(source)? } else { Blocks::of(source) };
         let merged = blocks.merged.as_deref();
         let mut rows = rows_of(source);
-        rows.extend(merged.iter().flat_map(|merged| merged_rows(merged)));
+        if let Some(merged) = merged {
+            rows.extend((0..merged.sums.len()).map(|i| merged_row(merged, i)));
+        }
         let more = merged.map_or(&[][..], |merged| merged.gaussians.sh());
         let mut scene = Self::of_rows(gpu, source, &rows, &[source.sh(), more], None)?;
         scene.blocks = Some(DeviceBlocks::upload(gpu, &blocks)?);
@@ -399,51 +411,77 @@ impl DeviceScene {
     ) -> Result<Self> {
         let (old_gaussians, old_sh) = old.map(|old| (old.gaussians, old.sh)).unzip();
         let sh: Vec<&[u8]> = sh.iter().map(|part| bytemuck::cast_slice(part)).collect();
-        Ok(Self {
+        Ok(Self::without_blocks(
+            source,
+            narrow("gaussians", rows.len())?,
+            brightest(source),
+            gpu.upload("gaussians", &[bytemuck::cast_slice(rows)], old_gaussians)?,
+            gpu.upload("sh", &sh, old_sh)?,
+        ))
+    }
+
+    /// `count` Gaussians of `source`, whose colours are at most `brightest`, in these buffers.
+    pub(super) fn without_blocks(
+        source: &Gaussians,
+        count: u32,
+        brightest: f32,
+        gaussians: wgpu::Buffer,
+        sh: wgpu::Buffer,
+    ) -> Self {
+        Self {
             shape: source.shape_identity(),
-            count: narrow("gaussians", rows.len())?,
+            count,
             sh_count: source.sh_count() as u32,
-            brightest: brightest(source),
-            gaussians: gpu.upload("gaussians", &[bytemuck::cast_slice(rows)], old_gaussians)?,
-            sh: gpu.upload("sh", &sh, old_sh)?,
+            brightest,
+            gaussians,
+            sh,
             blocks: None,
             merged: None,
             labels: None,
-        })
+            part: None,
+        }
     }
 }
 
 /// Gaussians as the shaders read them.
 fn rows_of(source: &Gaussians) -> Vec<GaussianRow> {
-    let row = |i: usize| GaussianRow {
+    let all = (0..source.len()).into_par_iter().with_min_len(1 << 14);
+    all.map(|i| row_of(source, i)).collect()
+}
+
+/// Gaussian `i` as the shaders read it.
+pub(super) fn row_of(source: &Gaussians, i: usize) -> GaussianRow {
+    GaussianRow {
         mean: source.means()[i],
         opacity: source.opacities()[i],
         quat: source.quats()[i],
         scale: source.scales()[i],
         source: source.source()[i].view.into(),
-    };
-    (0..source.len()).into_par_iter().with_min_len(1 << 14).map(row).collect()
+    }
 }
 
-/// Merged Gaussians as the shaders read them: the upper half of `source` is that of the sum.
-fn merged_rows(merged: &Merged) -> Vec<GaussianRow> {
-    let mut rows = rows_of(&merged.gaussians);
-    rows.iter_mut().zip(&merged.sums).for_each(|(row, sum)| row.source |= sum.to_bits());
-    rows
+/// Merged Gaussian `i` as the shaders read it: the upper half of `source` is that of the sum.
+pub(super) fn merged_row(merged: &Merged, i: usize) -> GaussianRow {
+    let row = row_of(&merged.gaussians, i);
+    GaussianRow { source: row.source | merged.sums[i].to_bits(), ..row }
 }
 
 /// Scenes on the device, the most recently drawn last.
 #[derive(Debug)]
 pub(super) struct SceneCache {
-    scenes: Vec<DeviceScene>,
-    bytes_max: u64,
-    blocks_from: usize,
+    pub(super) scenes: Vec<DeviceScene>,
+    /// Bytes of the scenes, of which one may be larger: then the device has a part of it.
+    pub(super) bytes_max: u64,
+    pub(super) blocks_from: usize,
+    /// Blocks of the scenes that it has parts of.
+    pub(super) blocks: BlockCache,
 }
 
 impl SceneCache {
     /// For `bytes_max` bytes of scenes, with blocks from so many Gaussians on.
     pub(super) fn new(bytes_max: u64, blocks_from: usize) -> Self {
-        Self { scenes: Vec::new(), bytes_max, blocks_from }
+        let blocks = BlockCache::new(blocks_from);
+        Self { scenes: Vec::new(), bytes_max, blocks_from, blocks }
     }
 
     /// The scene of `source`, uploaded once; if `labelled`, with the entries of `source`, and if
@@ -459,7 +497,7 @@ impl SceneCache {
         let shape = source.shape_identity();
         let held = self.scenes.iter().position(|scene| scene.shape == shape);
         let scene = match held.map(|at| self.scenes.remove(at)) {
-            Some(scene) if !detailed || scene.blocks.is_none() || scene.merged.is_some() => scene,
+            Some(scene) if scene.is_whole(detailed) => scene,
             coarse => {
                 if coarse.is_some() {
                     drop(coarse);
@@ -471,18 +509,26 @@ impl SceneCache {
         let last = self.scenes.len();
         self.scenes.push(scene);
         let scene = &mut self.scenes[last];
-        let labels_of = scene.labels.as_ref().map(|labels| labels.identity);
-        if labelled && labels_of != Some(source.identity()) {
-            let merged = scene.merged.as_deref();
-            scene.labels = Some(DeviceLabels::upload(gpu, source, merged)?);
+        if labelled && !scene.has_labels_of(source) {
+            let mut entries = source.semantic_index().to_vec();
+            entries.extend(scene.merged.iter().flat_map(|merged| merged.entries(source).to_vec()));
+            scene.labels = Some(DeviceLabels::upload(gpu, source.identity(), entries)?);
         }
         Ok(scene.clone())
     }
 
-    /// Uploads a scene. Others leave to make room, the least recently drawn first.
+    /// Uploads a scene.
     fn upload(&mut self, gpu: &Gpu, source: &Gaussians, detailed: bool) -> Result<DeviceScene> {
         let from = self.blocks_from;
-        let upload = || DeviceScene::for_views(gpu, source, from, detailed);
+        self.uploaded(gpu, || DeviceScene::for_views(gpu, source, from, detailed))
+    }
+
+    /// What `upload` uploads. Others leave to make room, the least recently drawn first.
+    pub(super) fn uploaded(
+        &mut self,
+        gpu: &Gpu,
+        upload: impl Fn() -> Result<DeviceScene>,
+    ) -> Result<DeviceScene> {
         let scene = match upload() {
             // The other scenes may hold the memory: drop them and try once more.
             Err(error) if error.code() == ErrorCode::LimitExceeded && !self.scenes.is_empty() => {

@@ -12,7 +12,7 @@ use super::{
     profile::Marks,
     scratch::Scratch,
 };
-use crate::{error::Result, scene::Gaussians};
+use crate::{RenderRequest, error::Result, scene::Gaussians, view::View};
 
 /// A device, its kernels and its scenes. Clones share them.
 #[derive(Clone, Debug)]
@@ -49,6 +49,21 @@ impl Context {
             old => DeviceScene::upload(&self.on.gpu, gaussians, old)?,
         };
         Ok(learnt.insert(scene).clone())
+    }
+
+    /// The Gaussians that `view`, all of `request` or a band of it, shows.
+    pub(super) fn shown(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        view: &View,
+    ) -> Result<DeviceScene> {
+        self.on.scenes.lock().shown(&self.on.gpu, gaussians, request, view)
+    }
+
+    /// Whether the device has only parts of the scene of `gaussians`.
+    pub(super) fn pages(&self, gaussians: &Gaussians, detailed: bool) -> bool {
+        self.on.scenes.lock().pages(&self.on.gpu, gaussians, detailed)
     }
 
     /// The scene of `gaussians`; if `labelled`, with its entries; if `detailed`, with merged ones.

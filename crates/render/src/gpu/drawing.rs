@@ -100,12 +100,19 @@ impl<'a> Drawing<'a> {
         scene: &DeviceScene,
     ) -> Result<Self> {
         let view = View::new(origin, request)?;
-        let mut row = ViewRow::of(&view, request, scene.brightest);
-        (row.gaussian_count, row.sh_count) = (scene.count, scene.sh_count);
-        row.block_count = scene.block_count();
+        let row = ViewRow::of(&view, request, scene.brightest);
         // The bands are appended.
         let frame = Frame::blank([view.width, view.height], request, 0);
-        Ok(Self { row, request, frame, weights: Vec::new(), weights_max: 0 })
+        let mut drawing = Self { row, request, frame, weights: Vec::new(), weights_max: 0 };
+        drawing.draws(scene);
+        Ok(drawing)
+    }
+
+    /// The next bands are of `scene`, the whole or a part.
+    pub(super) fn draws(&mut self, scene: &DeviceScene) {
+        let row = &mut self.row;
+        (row.gaussian_count, row.sh_count) = (scene.count, scene.sh_count);
+        row.block_count = scene.block_count();
     }
 
     /// The frame of all bands.

@@ -18,6 +18,7 @@ mod drawing;
 mod frame;
 #[cfg(feature = "testing")]
 pub mod internals;
+mod parts;
 mod pipelines;
 mod pool;
 mod profile;

@@ -43,7 +43,7 @@ fn scattered(count: usize, seed: u64) -> Gaussians {
 }
 
 /// A camera anywhere, of any field of view, with a part of its picture and with photos or without.
-fn any_request(random: &mut Random) -> RenderRequest {
+pub(crate) fn any_request(random: &mut Random) -> RenderRequest {
     let degrees = [0.1, 3.0, 40.0, 90.0, 140.0, 170.0][(random.bits() % 6) as usize];
     let (width, height) = (20 + (random.bits() % 90) as u32, 20 + (random.bits() % 70) as u32);
     let focal = 0.5 * f64::from(width) / f64::to_radians(0.5 * degrees).tan();

@@ -23,6 +23,7 @@ mod labels;
 mod merged;
 mod one_pass;
 mod oracle;
+mod parts;
 mod pitfalls;
 mod pool;
 mod pose;

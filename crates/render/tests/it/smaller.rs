@@ -3,7 +3,17 @@
 use std::sync::Arc;
 
 use segsplat_core::scene::{Camera, Gaussians, RawGaussians};
-use segsplat_render::{Kinds, RenderRequest, Renderer, Source, constants::OWN_SIZE, oracle};
+use segsplat_render::{
+    Kinds, RenderRequest, Renderer, Source,
+    constants::OWN_SIZE,
+    cpu::{
+        footprint::Footprint,
+        lanes::KernelOptions,
+        project::{Projected, project},
+    },
+    oracle,
+    view::View,
+};
 use segsplat_testing::{
     compare::{Tolerance, compare, oracle_samples, samples},
     scenes::{camera, checked, push, request, two_views},
@@ -31,6 +41,57 @@ fn view(
     camera.intrinsics = middle.intrinsics.resized(side, side);
     let sources: Arc<[Source]> = [source(-0.4), source(0.4)].into();
     (checked(raw), RenderRequest { sources, ..request(camera) })
+}
+
+/// The kernels leave work out where no Gaussian of a few neighbours needs it.
+#[test]
+fn what_neighbours_need_changes_no_bit() {
+    let (own, middle) = two_views(32, 5);
+    let mut raw = own.into_raw();
+    // One source pixel after the other: from much smaller than shown to much larger, in steps.
+    let count = raw.means.len() as u16;
+    raw.source.iter_mut().zip(0..).for_each(|(source, i)| source.view = i);
+    let source = |i: u16| Source {
+        center: [0.0; 3],
+        axis: [0.0, 0.0, 1.0],
+        scale: (0.2 * 40.0_f64.powf(f64::from(i) / f64::from(count)) / middle.intrinsics.fx) as f32,
+        behind: false,
+    };
+    let request = RenderRequest { sources: (0..count).map(source).collect(), ..request(middle) };
+    let footprints = |order: &[usize]| {
+        let raw = raw.clone();
+        let scene = checked(RawGaussians {
+            means: order.iter().map(|&i| raw.means[i]).collect(),
+            quats: order.iter().map(|&i| raw.quats[i]).collect(),
+            scales: order.iter().map(|&i| raw.scales[i]).collect(),
+            opacities: order.iter().map(|&i| raw.opacities[i]).collect(),
+            sh: order.iter().map(|&i| raw.sh[i]).collect(),
+            semantic_index: vec![0; order.len()],
+            source: order.iter().map(|&i| raw.source[i]).collect(),
+            ..raw
+        });
+        let view = View::new(scene.origin(), &request).expect("a view");
+        let mut projected = Projected::default();
+        project(&scene, &request, &view, KernelOptions::default(), &mut projected);
+        let mut found = vec![Footprint::default(); order.len()];
+        for (&i, (footprint, tiles)) in
+            order.iter().zip(projected.footprints.iter().zip(&projected.tiles_per_gauss))
+        {
+            if *tiles > 0 {
+                found[i] = *footprint;
+            }
+        }
+        found
+    };
+    let alike: Vec<usize> = (0..raw.means.len()).collect();
+    // Each has neighbours of all sizes.
+    let mut mixed = alike.clone();
+    mixed.sort_by_key(|i| i.wrapping_mul(0x9e37_79b9) % 4_093);
+    let (got, want) = (footprints(&alike), footprints(&mixed));
+    assert!(want.iter().filter(|one| one.opacity > 0.0).count() > 1_500, "most are seen");
+    for (i, (got, want)) in got.iter().zip(&want).enumerate() {
+        assert!(got == want, "{i}: {got:?} is not {want:?}");
+    }
 }
 
 fn each(check: impl Fn(&dyn Renderer)) {

@@ -196,7 +196,7 @@ fn shade_twin() {
         let request = request(camera(200, 150));
         let mut projected = projected(&gaussians, &request);
         let view = view_of(&gaussians, &request);
-        shade::shade(&gaussians, &view, KernelOptions::default(), &mut projected);
+        shade::shade(&gaussians, &view, KernelOptions::default(), false, &mut projected);
         let Projected { footprints, tiles_per_gauss: tiles, .. } = projected;
         let got = gpu.internals().shade(&gaussians, &request, &tiles).expect("colours");
         let mut seen = 0;
@@ -283,7 +283,7 @@ fn rasterize_twin() {
         let mut projected = projected(&gaussians, &request);
         let order = depth_order(&projected);
         let (mut offsets, mut isects, mut ranges) = (vec![], vec![], vec![]);
-        shade::shade(&gaussians, &view, KernelOptions::default(), &mut projected);
+        shade::shade(&gaussians, &view, KernelOptions::default(), false, &mut projected);
         let grid = whole(&view);
         let counts =
             order.iter().map(|&p| projected.tiles_per_gauss[radix_sort::value(p) as usize]);

@@ -26,15 +26,17 @@ use rayon::prelude::*;
 
 use crate::{
     error::{Error, Result},
-    scene::{Capture, PosedPhoto, Warning, WarningCode, unless_cancelled},
+    scene::{Camera, Capture, PosedPhoto, Warning, WarningCode, unless_cancelled},
 };
 use diagnose::{name, warning};
 use gray::GrayView;
 
-pub use sets::view_sets;
+pub use sets::{more_view_sets, view_sets};
 
 /// Neighbours that each photo is compared with.
 const NEIGHBORS: usize = 3;
+/// Photos of a capture that each photo which joins it is measured with.
+const OLD_PARTNERS: usize = 4;
 /// Photos that one warning names.
 const NAMED_MAX: usize = 4;
 /// Of this many photos and more, one neighbour fewer.
@@ -78,6 +80,45 @@ pub fn analyse(photos: &[PosedPhoto], cancel: &AtomicBool) -> Result<Capture> {
         &mut overlap,
     )?);
     Ok(Capture { near_far: ranges.near_far, overlap, median_depth: ranges.median_depth, warnings })
+}
+
+/// Measures photos that join a capture: the first photos are those of `known`, which stays as it
+/// was. Only the others are measured, with the photos that stand nearest to each, so that the time
+/// does not grow with the capture.
+///
+/// # Errors
+/// As [`analyse`], of these photos.
+pub fn analyse_more(
+    photos: &[PosedPhoto],
+    known: &Capture,
+    cancel: &AtomicBool,
+) -> Result<Capture> {
+    let (before, all) = (known.near_far.len(), photos.len());
+    let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
+    let ranked = pairs::ranked(&cameras)?;
+    let partners = |new: usize| {
+        let old = ranked[new].iter().copied().filter(|&i| i < before).take(OLD_PARTNERS);
+        old.chain([new])
+    };
+    let mut asked: Vec<usize> = (before..all).flat_map(partners).collect();
+    asked.sort_unstable();
+    asked.dedup();
+    let some: Vec<PosedPhoto> = asked.iter().map(|&i| photos[i].clone()).collect();
+    let found = analyse(&some, cancel)?;
+    let mut capture = known.clone();
+    capture.near_far.resize(all, [0.0; 2]);
+    capture.overlap.iter_mut().for_each(|row| row.resize(all, 0.0));
+    capture.overlap.resize(all, vec![0.0; all]);
+    for (a, &i) in asked.iter().enumerate() {
+        if i >= before {
+            capture.near_far[i] = found.near_far[a];
+        }
+        for (b, &j) in asked.iter().enumerate().filter(|&(_, &j)| i.max(j) >= before) {
+            capture.overlap[i][j] = found.overlap[a][b];
+        }
+    }
+    capture.warnings.extend(found.warnings);
+    Ok(capture)
 }
 
 /// How well photos agree under their cameras: the share of their matchable pixels that neighbours

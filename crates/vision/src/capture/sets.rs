@@ -21,6 +21,18 @@ const SHARED_EVERY: usize = 4;
 pub fn view_sets(
     capture: &Capture,
     photos: &[PosedPhoto],
+    views: [usize; 2],
+    neighbors_max: usize,
+) -> Vec<ViewSet> {
+    more_view_sets(capture, photos, 0, views, neighbors_max)
+}
+
+/// The same where the first `known` photos are in sets already: sets that have all others.
+#[must_use]
+pub fn more_view_sets(
+    capture: &Capture,
+    photos: &[PosedPhoto],
+    known: usize,
     [views_min, views_max]: [usize; 2],
     neighbors_max: usize,
 ) -> Vec<ViewSet> {
@@ -30,7 +42,7 @@ pub fn view_sets(
     let worth = worth(capture, photos);
     let usable: Vec<usize> =
         (0..n).filter(|&i| (0..n).any(|j| j != i && worth[i][j] > 0.0)).collect();
-    let mut covered = vec![false; n];
+    let mut covered: Vec<bool> = (0..n).map(|i| i < known).collect();
     let mut sets = Vec::new();
     while let Some(seed) = next_seed(&usable, &covered, &worth) {
         let mut views = vec![seed];

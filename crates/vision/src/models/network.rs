@@ -541,8 +541,7 @@ impl Opener {
         let file = own.unwrap_or(&self.file);
         let arithmetic = match (provider, own) {
             (Provider::Cpu, Some(_)) => Arithmetic::EightBits,
-            (Provider::Cpu, None) => Arithmetic::Fast,
-            (Provider::Cuda | Provider::Webgpu, _) => Arithmetic::F32,
+            _ => Arithmetic::F32,
         };
         let weights = PrepackedWeights::new();
         let session = |_| {
@@ -840,7 +839,7 @@ pub(super) fn misfits(
     wanted: &[Wanted<'_>],
 ) -> Vec<String> {
     let path = bundle.path(file);
-    match runtime.session(&path, Provider::Cpu, options.threads, None, Arithmetic::Fast, false) {
+    match runtime.session(&path, Provider::Cpu, options.threads, None, Arithmetic::F32, false) {
         Ok(session) => FileSignature::of(&session)
             .misfits(wanted)
             .into_iter()

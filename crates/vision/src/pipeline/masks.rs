@@ -3,7 +3,10 @@
 //! The first prompts of a photo lie where the masks of earlier photos reappear. The Gaussians of
 //! these masks give the places in the world.
 
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::{
+    collections::BTreeMap,
+    sync::atomic::{AtomicBool, AtomicUsize, Ordering},
+};
 
 use glam::DVec3;
 use parking_lot::Mutex;
@@ -20,6 +23,11 @@ use crate::{
     seen_at,
     segment::{self, PromptDecoder, Seed, Settings},
 };
+
+/// Gives the masks of each photo to its argument, in any order.
+pub type MasksOfPhotos<'a> = dyn Fn(&GiveMasks<'_>) -> Result<()> + Sync + 'a;
+/// Takes the masks of the photo of this number. Fails with `cancelled` where they are not wanted.
+pub type GiveMasks<'a> = dyn Fn(usize, PhotoMasks) -> Result<()> + Sync + 'a;
 
 /// Cells along one side of the photo, each of which gets one seed: two views of a thing seed once.
 const SEED_CELLS: usize = 32;
@@ -144,16 +152,31 @@ pub fn photo_masks(
     progress: &(dyn Fn(f32) + Sync),
     cancel: &AtomicBool,
 ) -> Result<Vec<PhotoMasks>> {
+    collected(photos.len(), progress, &|give| {
+        each_photo(network, photos, gaussians, settings, give, cancel)
+    })
+}
+
+/// As [`photo_masks`]; those of a photo are given as soon as they are found.
+///
+/// # Errors
+/// As [`photo_masks`], and what `give` says.
+pub fn each_photo(
+    network: &MaskNetwork,
+    photos: &[PosedPhoto],
+    gaussians: Option<&Gaussians>,
+    settings: &Settings,
+    give: &GiveMasks<'_>,
+    cancel: &AtomicBool,
+) -> Result<()> {
     let gaussians = gaussians.filter(|_| settings.use_seeds);
     if gaussians.is_none() && network.provider() != Provider::Cpu {
-        return side_by_side(network, photos, settings, progress, cancel);
+        return each_of_two(network, photos, settings, give, cancel);
     }
     let encoded = |posed: &PosedPhoto| SeenPhoto::new(network, &posed.photo);
-    let mut masks: Vec<PhotoMasks> = Vec::new();
     let mut places: Vec<DVec3> = Vec::new();
     let mut next = photos.first().map(encoded);
     for (at, posed) in photos.iter().enumerate() {
-        progress(at as f32 / photos.len() as f32);
         let seeds = seeds_at(posed, &places);
         let seen = next.take().unwrap_or_else(|| encoded(posed))?;
         // The next photo is encoded meanwhile.
@@ -167,10 +190,9 @@ pub fn photo_masks(
         if let Some(gaussians) = gaussians {
             places.extend(middles(gaussians, photos, at, &of_photo));
         }
-        masks.push(of_photo);
+        give(at, of_photo)?;
     }
-    progress(1.0);
-    Ok(masks)
+    Ok(())
 }
 
 /// As [`photo_masks`] without seeds, two photos at a time: while the host filters the masks of one,
@@ -185,23 +207,30 @@ pub fn side_by_side(
     progress: &(dyn Fn(f32) + Sync),
     cancel: &AtomicBool,
 ) -> Result<Vec<PhotoMasks>> {
-    let (locks, next, done) = (PartLocks::default(), AtomicUsize::new(0), Mutex::new(0_usize));
+    collected(photos.len(), progress, &|give| each_of_two(network, photos, settings, give, cancel))
+}
+
+fn each_of_two(
+    network: &MaskNetwork,
+    photos: &[PosedPhoto],
+    settings: &Settings,
+    give: &GiveMasks<'_>,
+    cancel: &AtomicBool,
+) -> Result<()> {
+    let (locks, next) = (PartLocks::default(), AtomicUsize::new(0));
     let found = |posed: &PosedPhoto| {
         unless_cancelled(cancel)?;
         let seen = SeenPhoto::in_turn(network, &posed.photo, Some(&locks))?;
         segment::everything(&seen, &posed.photo, settings, &[], cancel)
     };
     let work = || {
-        let mut mine = Vec::new();
         loop {
             let at = next.fetch_add(1, Ordering::Relaxed);
-            let Some(posed) = photos.get(at) else { return Ok(mine) };
+            let Some(posed) = photos.get(at) else { return Ok(()) };
             // After a failure no other photo is begun.
-            let masks = found(posed).inspect_err(|_| next.store(photos.len(), Ordering::Relaxed));
-            mine.push((at, masks?));
-            let mut done = done.lock();
-            *done += 1;
-            progress(*done as f32 / photos.len() as f32);
+            found(posed)
+                .and_then(|masks| give(at, masks))
+                .inspect_err(|_| next.store(photos.len(), Ordering::Relaxed))?;
         }
     };
     let (mine, other) = std::thread::scope(|scope| {
@@ -209,10 +238,23 @@ pub fn side_by_side(
         let mine = work();
         (mine, other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
     });
-    let mut all: Vec<(usize, PhotoMasks)> = mine?;
-    all.extend(other?);
-    all.sort_unstable_by_key(|(at, _)| *at);
-    Ok(all.into_iter().map(|(_, masks)| masks).collect())
+    mine.and(other)
+}
+
+/// The masks that `find` gives, in the order of the photos.
+fn collected(
+    photos: usize,
+    progress: &(dyn Fn(f32) + Sync),
+    find: &MasksOfPhotos<'_>,
+) -> Result<Vec<PhotoMasks>> {
+    let all = Mutex::new(BTreeMap::new());
+    find(&|at, masks| {
+        let mut all = all.lock();
+        all.insert(at, masks);
+        progress(all.len() as f32 / photos as f32);
+        Ok(())
+    })?;
+    Ok(all.into_inner().into_values().collect())
 }
 
 /// Where the masks of earlier photos reappear in photo `to`: of each mask the Gaussian nearest to

@@ -6,6 +6,7 @@
 //! [`semantics`] makes the semantics of a scene.
 
 pub mod cameras;
+pub mod growth;
 mod loader;
 pub mod masks;
 mod networks;
@@ -31,7 +32,10 @@ use crate::{
     lift::{self, FuseOptions, Fusion, UnionOptions},
     limits::Limits,
     meter,
-    models::{Bundle, Geometry, GeometryInput, Network, NetworkOptions, Provider, Runtime},
+    models::{
+        Bundle, Geometry, GeometryInput, GeometryManifest, Network, NetworkOptions, Provider,
+        Runtime,
+    },
     photos::{self, ReadPhotos, ReadUnposed},
     refine::split,
     scene::{
@@ -343,12 +347,9 @@ fn see(
     options: &SceneOptions,
     watch: Watch<'_>,
 ) -> Result<Seen> {
-    let Watch { progress, cancel } = watch;
     let mut stages = Stages::new(watch);
     let manifest = pipeline.geometry.manifest();
-    let range = [manifest.views_min.max(2), manifest.views_max];
-    let one_set = manifest.many.is_some() && photos.len() <= manifest.views_max;
-    let views_max = views_max(options.max_views, range, one_set)?;
+    let views = views_of(manifest, options, photos.len())?;
     let method = options.method();
     method.check()?;
     if photos.len() < manifest.views_min {
@@ -360,29 +361,38 @@ fn see(
     }
     let (capture, sets) = stages.run(Stage::Capture, || {
         pipeline.workers.install(|| {
-            let capture = capture::analyse(photos, cancel)?;
-            let views = [manifest.views_min, views_max];
+            let capture = capture::analyse(photos, watch.cancel)?;
             let sets = capture::view_sets(&capture, photos, views, manifest.neighbors_max);
             Ok((capture, sets))
         })
     })?;
-    let views = stages.run(Stage::Geometry, || {
-        let mut views = Vec::new();
-        for (done, set) in sets.iter().enumerate() {
-            unless_cancelled(cancel)?;
-            progress(Stage::Geometry, fraction(done, sets.len()));
-            let input = GeometryInput {
-                photos,
-                views: &set.views,
-                near_far: &capture.near_far,
-                median_depth: capture.median_depth,
-                neighbors: &set.neighbors,
-            };
-            views.extend(pipeline.geometry.run(&input)?);
-        }
-        Ok(views)
-    })?;
+    let views =
+        stages.run(Stage::Geometry, || of_sets(pipeline, photos, &capture, &sets, watch))?;
     Ok(Seen { views, capture, sets, method, stages: stages.times })
+}
+
+/// What the network says of sets of photos, one set after the other.
+fn of_sets(
+    pipeline: &Pipeline,
+    photos: &[PosedPhoto],
+    capture: &Capture,
+    sets: &[ViewSet],
+    watch: Watch<'_>,
+) -> Result<Vec<ViewGaussians>> {
+    let mut views = Vec::new();
+    for (done, set) in sets.iter().enumerate() {
+        unless_cancelled(watch.cancel)?;
+        (watch.progress)(Stage::Geometry, fraction(done, sets.len()));
+        let input = GeometryInput {
+            photos,
+            views: &set.views,
+            near_far: &capture.near_far,
+            median_depth: capture.median_depth,
+            neighbors: &set.neighbors,
+        };
+        views.extend(pipeline.geometry.run(&input)?);
+    }
+    Ok(views)
 }
 
 /// One scene of what the network said of its photos.
@@ -477,6 +487,17 @@ impl<'a> Stages<'a> {
         (self.watch.progress)(stage, 1.0);
         Ok(done)
     }
+}
+
+/// The fewest and the most views of a set of a scene of so many photos.
+fn views_of(
+    manifest: &GeometryManifest,
+    options: &SceneOptions,
+    photos: usize,
+) -> Result<[usize; 2]> {
+    let range = [manifest.views_min.max(2), manifest.views_max];
+    let one_set = manifest.many.is_some() && photos <= manifest.views_max;
+    Ok([manifest.views_min, views_max(options.max_views, range, one_set)?])
 }
 
 /// Views the network takes at once: the caller's wish, within what the network can. Where there is

@@ -143,6 +143,34 @@ struct Work {
     time: Duration,
 }
 
+/// The scene without the photos that are held out, which says how good versions are.
+struct Proof<'a> {
+    /// Numbers of these photos.
+    held: &'a [usize],
+    start: Scene,
+    /// As far as they are refined.
+    gaussians: Gaussians,
+    /// How they show the held-out photos.
+    judged: Option<Judged>,
+    /// PSNR of what is served at these photos.
+    before: Option<f64>,
+}
+
+impl Proof<'_> {
+    fn psnr(&self) -> Option<f64> {
+        self.judged.map(|judged| judged.psnr)
+    }
+}
+
+/// The scene of all photos, as far as it is refined.
+struct Whole {
+    start: Scene,
+    gaussians: Gaussians,
+    steps: u32,
+    /// [`Refined::overfit`].
+    overfit: f64,
+}
+
 /// A refinement at work.
 struct Parts<'a, 'c> {
     renderer: &'a dyn DifferentiableRenderer,
@@ -180,98 +208,130 @@ impl Parts<'_, '_> {
 
     /// Photos of which those of the numbers `held` say how good versions are.
     fn watched(&mut self, held: &[usize]) -> Result<Refined> {
-        let (mut proof_start, mut first) = self.begin(held)?;
-        let mut proof = first.clone();
-        let mut before = self.judged_before(held, &proof_start)?;
-        let earlier = self.scene.meta.report.refinement.as_ref().and_then(|it| it.psnr_after);
-        let mut last: Option<Judged> = None;
+        let (start, first) = self.begin(held)?;
+        let before = self.judged_before(held, &start)?;
+        let mut proof = Proof { held, start, gaussians: first.clone(), judged: None, before };
         let report = self.as_before(before);
         let mut found = Refined { report, overfit: None, pose_gain: None, versions: 0 };
-        // Of all photos: what it began with, how it is now, and how many steps it had.
-        let mut whole: Option<(Scene, Gaussians, u32)> = None;
+        let (mut first, mut whole) = (Some(first), None::<Whole>);
         while let Some(part) = self.next_part(whole.is_some()) {
-            let is_first = self.done.steps == 0;
-            let options = self.options_of(part, is_first);
-            let proof_options = RefineOptions {
-                budget: of_budget(part, self.proof_share()),
-                gaussians_max: self.share_without(held, options.gaussians_max),
-                ..options
-            };
-            let proven = self.work(&proof_start, &proof, held, &proof_options)?;
-            proof = proven.gaussians;
-            tracing::debug!(steps = proven.steps, judged = ?proven.judged, "proven");
-            let mut judged = proven.judged;
-            if is_first && self.options.pose_rate > 0.0 || self.mends {
-                let (fitting, gain) = self.fit_held_out(held, &proof_start, &proof, judged)?;
-                judged = fitting;
-                found.pose_gain = found.pose_gain.or(gain);
+            let options = self.options_of(part, first.is_some());
+            let last = proof.judged.filter(|_| whole.is_some());
+            let proven = self.prove(&mut proof, part, &options)?;
+            if let Some(first) = first.take() {
+                found.pose_gain = self.mend_first(&mut proof, first, part, &options)?;
+                found.report = self.as_before(proof.before);
+            } else if self.mends {
+                self.fit_held_out(&mut proof)?;
             }
-            if is_first && self.leave_out(&proof_start, &proof)? {
-                proof = proof.only(|i| !self.is_left_out(&proof, i));
-                first = first.only(|i| !self.is_left_out(&first, i));
-                let held_photos = self.parted(held).1;
-                judged = judged_as_plain(self.renderer, &proof_start, &proof, &held_photos)?;
-            }
-            if is_first && self.mends {
-                if let Some(poses) = (self.calls.recast)()? {
-                    self.stand_all(&poses);
-                    self.made.clone_from(&poses);
-                    (proof_start, first) = self.begin(held)?;
-                    first = first.only(|i| !self.is_left_out(&first, i));
-                }
-                let settled = self.settle_cameras(held, &proof_start, &first)?;
-                proof = self.work(&proof_start, &settled, held, &proof_options)?.gaussians;
-                judged = self.fit_held_out(held, &proof_start, &proof, None)?.0;
-            }
-            if is_first && (self.mends || !self.left_out.is_empty()) {
-                before = self.judged_before_fitting(held, &proof_start, &first)?;
-                found.report = self.as_before(before);
-            }
-            let psnr = judged.map(|judged| judged.psnr);
-            let gains = match (last, judged) {
-                (Some(last), Some(now)) => now.score() > last.score() + self.options.gain_min,
-                _ => psnr > if earlier > before { earlier } else { before },
-            };
-            if !gains {
+            if !self.is_better(&proof, last) {
                 // Too few steps may not have been enough; more that gain nothing are too many.
                 if whole.is_some() || proven.steps == 0 {
                     break;
                 }
                 continue;
             }
-            last = judged;
-            let (start, gaussians, steps) = match whole.take() {
+            let mut made = match whole.take() {
                 Some(whole) => whole,
-                None => {
-                    let (overfit, start, gaussians) =
-                        self.begin_whole(held, &proof_start, &proof)?;
-                    found.overfit = Some(overfit);
-                    (start, gaussians, 0)
-                }
+                None => self.begin_whole(&proof)?,
             };
-            let budget = self.rest_of(part, proven.time);
-            let options = RefineOptions { budget, ..options };
-            let mut made = self.work(&start, &gaussians, &[], &options)?;
-            if self.mends {
-                let back = self.anchor();
-                made.gaussians = carried(&made.gaussians, |_| Some(back))?;
-                proof = carried(&proof, |_| Some(back))?;
-            }
-            let steps = steps + made.steps;
-            found.report = self.report_of(&start, &made, steps, [before, psnr]);
+            let options = RefineOptions { budget: self.rest_of(part, proven.time), ..options };
+            found.report = self.publish(&mut made, &mut proof, &options)?;
+            found.overfit = Some(made.overfit);
             found.versions += 1;
-            let (gaussians, report) = (made.gaussians, found.report.clone());
-            let version = RefinedVersion { gaussians, report, poses: self.poses() };
-            (self.calls.publish)(&start, &version)?;
-            whole = Some((start, version.gaussians, steps));
+            whole = Some(made);
         }
         Ok(found)
     }
 
+    /// Goes on with the proof for its share of a part. What was done.
+    fn prove(
+        &mut self,
+        proof: &mut Proof<'_>,
+        part: RefineBudget,
+        options: &RefineOptions,
+    ) -> Result<Work> {
+        let options = RefineOptions {
+            budget: of_budget(part, self.proof_share()),
+            gaussians_max: self.share_without(proof.held, options.gaussians_max),
+            ..*options
+        };
+        let proven = self.work(&proof.start, &proof.gaussians, proof.held, &options)?;
+        tracing::debug!(steps = proven.steps, judged = ?proven.judged, "proven");
+        (proof.gaussians, proof.judged) = (proven.gaussians, proven.judged);
+        Ok(Work { steps: proven.steps, time: proven.time })
+    }
+
+    /// What the first proof says of the photos, which began with the Gaussians `first`: those that
+    /// cannot be right are left out, and where cameras are wrong it is made again with mended ones.
+    /// What the held-out photos gain by cameras that fit.
+    fn mend_first(
+        &mut self,
+        proof: &mut Proof<'_>,
+        mut first: Gaussians,
+        part: RefineBudget,
+        options: &RefineOptions,
+    ) -> Result<Option<f64>> {
+        let is_asked = self.options.pose_rate > 0.0;
+        let gain = if is_asked { self.fit_held_out(proof)? } else { None };
+        if self.leave_out(proof)? {
+            proof.gaussians = self.without_left_out(&proof.gaussians);
+            first = self.without_left_out(&first);
+            proof.judged = self.judged(proof)?;
+        }
+        if self.mends {
+            if let Some(poses) = (self.calls.recast)()? {
+                self.stand_all(&poses);
+                self.made.clone_from(&poses);
+                (proof.start, first) = self.begin(proof.held)?;
+                first = self.without_left_out(&first);
+            }
+            proof.gaussians = self.settle_cameras(proof.held, &proof.start, &first)?;
+            self.prove(proof, part, options)?;
+            self.fit_held_out(proof)?;
+        }
+        if self.mends || !self.left_out.is_empty() {
+            proof.before = self.judged_before_fitting(proof.held, &proof.start, &first)?;
+        }
+        Ok(gain)
+    }
+
+    /// Whether the proof is better than what is served, or enough so than it was at the `last`
+    /// version.
+    fn is_better(&self, proof: &Proof<'_>, last: Option<Judged>) -> bool {
+        if let (Some(last), Some(now)) = (last, proof.judged) {
+            return now.score() > last.score() + self.options.gain_min;
+        }
+        let earlier = self.scene.meta.report.refinement.as_ref().and_then(|it| it.psnr_after);
+        proof.psnr() > if earlier > proof.before { earlier } else { proof.before }
+    }
+
+    /// Goes on with the scene of all photos and publishes it. Its figures.
+    fn publish(
+        &mut self,
+        whole: &mut Whole,
+        proof: &mut Proof<'_>,
+        options: &RefineOptions,
+    ) -> Result<RefineReport> {
+        let mut made = self.work(&whole.start, &whole.gaussians, &[], options)?;
+        if self.mends {
+            let back = self.anchor();
+            made.gaussians = carried(&made.gaussians, |_| Some(back))?;
+            proof.gaussians = carried(&proof.gaussians, |_| Some(back))?;
+        }
+        whole.steps += made.steps;
+        let report = self.report_of(&whole.start, &made, whole.steps, [proof.before, proof.psnr()]);
+        let (gaussians, poses) = (made.gaussians, self.poses());
+        let version = RefinedVersion { gaussians, report: report.clone(), poses };
+        (self.calls.publish)(&whole.start, &version)?;
+        whole.gaussians = version.gaussians;
+        Ok(report)
+    }
+
     /// Leaves photos out from now on that the proof does not explain at all: their cameras cannot
     /// be right. Whether there are some.
-    fn leave_out(&mut self, start: &Scene, proof: &Gaussians) -> Result<bool> {
-        let shares = unexplained(self.renderer, start, proof, &self.photos)?;
+    fn leave_out(&mut self, proof: &Proof<'_>) -> Result<bool> {
+        let shares = unexplained(self.renderer, &proof.start, &proof.gaussians, &self.photos)?;
         let mut sorted = shares.clone();
         sorted.sort_unstable_by(f64::total_cmp);
         let least = LEFT_OUT_FROM.max(LEFT_OUT_FACTOR * sorted[sorted.len() / 2]);
@@ -280,9 +340,10 @@ impl Parts<'_, '_> {
         Ok(!self.left_out.is_empty())
     }
 
-    /// Whether Gaussian `i` came from a photo that is left out.
-    fn is_left_out(&self, gaussians: &Gaussians, i: usize) -> bool {
-        self.left_out.contains(&usize::from(gaussians.source()[i].view))
+    /// The Gaussians that did not come from photos that are left out.
+    fn without_left_out(&self, gaussians: &Gaussians) -> Gaussians {
+        let photo = |i: usize| usize::from(gaussians.source()[i].view);
+        gaussians.only(|i| !self.left_out.contains(&photo(i)))
     }
 
     /// The photos to learn from, and those of the numbers `held`.
@@ -322,27 +383,28 @@ impl Parts<'_, '_> {
         before
     }
 
-    /// How the proof shows the held-out photos, which was `judged`, and what they gain by cameras
-    /// that fit it. Their cameras are as wrong as the others: where cameras are mended, or this
-    /// gain says that they are to be, theirs fit from now on.
-    fn fit_held_out(
-        &mut self,
-        held: &[usize],
-        start: &Scene,
-        proof: &Gaussians,
-        judged: Option<Judged>,
-    ) -> Result<(Option<Judged>, Option<f64>)> {
+    /// How the proof shows the held-out photos.
+    fn judged(&self, proof: &Proof<'_>) -> Result<Option<Judged>> {
+        let held_photos = self.parted(proof.held).1;
+        judged_as_plain(self.renderer, &proof.start, &proof.gaussians, &held_photos)
+    }
+
+    /// What the held-out photos gain by cameras that fit the proof. Their cameras are as wrong as
+    /// the others: where cameras are mended, or this gain says that they are to be, theirs fit from
+    /// now on.
+    fn fit_held_out(&mut self, proof: &mut Proof<'_>) -> Result<Option<f64>> {
         let now = self.poses();
-        let poses = self.fitting(held, start, proof)?;
-        self.stand(&self.numbers(held).1, &poses);
-        let fitting = judged_as_plain(self.renderer, start, proof, &self.parted(held).1)?;
-        let gain = judged.zip(fitting).map(|(judged, fitting)| fitting.score() - judged.score());
+        let poses = self.fitting(proof.held, &proof.start, &proof.gaussians)?;
+        self.stand(&self.numbers(proof.held).1, &poses);
+        let fitting = self.judged(proof)?;
+        let gain =
+            proof.judged.zip(fitting).map(|(as_given, fits)| fits.score() - as_given.score());
         self.mends |= gain.is_some_and(|gain| gain > self.options.mends_from);
-        if self.mends {
-            return Ok((fitting, gain));
+        match self.mends {
+            true => proof.judged = fitting,
+            false => self.stand_all(&now),
         }
-        self.stand_all(&now);
-        Ok((judged, gain))
+        Ok(gain)
     }
 
     /// Where the cameras of the photos `held` fit these Gaussians.
@@ -570,31 +632,27 @@ impl Parts<'_, '_> {
         Ok((start, gaussians))
     }
 
-    /// The scene of all photos, what its refinement begins with, and how much the proof overfits.
-    fn begin_whole(
-        &mut self,
-        held: &[usize],
-        proof_start: &Scene,
-        proof: &Gaussians,
-    ) -> Result<(f64, Scene, Gaussians)> {
+    /// The scene of all photos, before its first step.
+    fn begin_whole(&mut self, proof: &Proof<'_>) -> Result<Whole> {
         let (start, gaussians) = self.begin(&self.left_out.clone())?;
         let gaussians = self.with_cameras(gaussians)?;
         let differs = |at: &dyn Fn(usize) -> usize| {
             let is_used = |i: &usize| !self.left_out.contains(i);
-            let held = held.iter().filter(|&i| is_used(i) && is_used(&(i - 1)));
+            let held = proof.held.iter().filter(|&i| is_used(i) && is_used(&(i - 1)));
             let photos: Vec<PosedPhoto> = held.map(|&i| self.photos[at(i)].clone()).collect();
-            let found = differences(self.renderer, proof_start, proof, &photos)?;
+            let found = differences(self.renderer, &proof.start, &proof.gaussians, &photos)?;
             Ok::<_, crate::error::Error>(found.iter().sum::<f64>() / found.len() as f64)
         };
         // The photo before each is learnt.
         let overfit = differs(&|i| i)? / differs(&|i| i - 1)?;
+        let begun = |gaussians| Whole { start, gaussians, steps: 0, overfit };
         if overfit > f64::from(self.options.overfit_max) {
-            return Ok((overfit, start, gaussians));
+            return Ok(begun(gaussians));
         }
-        let of_held = |i: usize| held.contains(&usize::from(gaussians.source()[i].view));
-        let room = self.options.gaussians_max.saturating_sub(proof.len());
+        let of_held = |i: usize| proof.held.contains(&usize::from(gaussians.source()[i].view));
+        let room = self.options.gaussians_max.saturating_sub(proof.gaussians.len());
         let more = fewer(&gaussians.only(of_held), room, self.options.seed)?;
-        Ok((overfit, start, proof.joined(&more)?))
+        Ok(begun(proof.gaussians.joined(&more)?))
     }
 
     /// The share of `all` Gaussians that belongs to the photos but those of the numbers `held`.

@@ -5,13 +5,24 @@
 //! the photos, so [`label_photos`] can run while the scene is made. Every Gaussian takes the entry
 //! of the pixel that made it. [`Method`] says whether other photos vote.
 
-use std::sync::Arc;
+use std::{
+    collections::BTreeMap,
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+        mpsc,
+    },
+};
 
 use rayon::prelude::*;
 
-use super::{Pipeline, Stages, count, fraction, masks, networks::opened};
+use super::{
+    Pipeline, Stages, count, fraction,
+    masks::{self, MasksOfPhotos},
+    networks::opened,
+};
 use crate::{
-    error::{Error, Result},
+    error::{Error, ErrorCode, Result},
     models::{ImageText, MaskNetwork},
     scene::{
         Bank, BankMask, Crop, CropShape, DenseFeatures, Gaussians, IndexMap, Method, Photo,
@@ -26,12 +37,9 @@ const CROPS_A_PHOTO: usize = 5;
 /// Masks of a row that are kept beside it. Half of them name a thing, so more say little.
 const VIEWS_MAX: usize = 16;
 
-/// Gives the masks of each photo. Its argument takes the fraction that is done, 0..1.
-pub type MasksOfPhotos<'a> = dyn Fn(&(dyn Fn(f32) + Sync)) -> Result<Vec<PhotoMasks>> + Sync + 'a;
-
 /// What gives masks and embeddings.
 pub struct SemanticsTools<'a, P> {
-    /// The masks of each photo.
+    /// The masks of each photo; those that are there are embedded while others are found.
     pub masks: &'a MasksOfPhotos<'a>,
     /// A batch of crops as `embed` takes it.
     pub prepare: &'a (dyn Fn(&[Crop]) -> P + Sync),
@@ -153,15 +161,34 @@ pub fn label_photos(
     method: &Method,
     watch: Watch<'_>,
 ) -> Result<LabelledPhotos> {
+    label_more(pipeline, photos, None, seeds, method, watch)
+}
+
+/// The same where the first photos are labelled already, as `known` says: only the others go
+/// through the networks. Masks that depend on other photos, as those by `seeds`, are all made anew.
+///
+/// # Errors
+/// As [`label_photos`].
+pub fn label_more(
+    pipeline: &Pipeline,
+    photos: &[PosedPhoto],
+    known: Option<&LabelledPhotos>,
+    seeds: Option<&Gaussians>,
+    method: &Method,
+    watch: Watch<'_>,
+) -> Result<LabelledPhotos> {
+    // A refinement changes how a scene is drawn, and nothing of its masks.
+    let of_masks = |of: &Method| Method { front_photos: 0, magnify: false, ..of.clone() };
+    let same = |known: &&LabelledPhotos| of_masks(&known.report.method) == of_masks(method);
+    let known = known.filter(|_| seeds.is_none()).filter(same);
+    let photos = known.map_or(photos, |known| photos.get(known.masks.len()..).unwrap_or_default());
     let (network, towers) = (pipeline.masks()?, pipeline.image_text()?);
     let settings = masks::settings(network.manifest(), method);
     let image = &towers.manifest().image;
     let weight = |area: f64| image.dense.as_ref().map_or(0.0, |dense| dense.weight(area));
     let context = Context { dense: &|photo| towers.dense(photo), weight: &weight };
     let tools = SemanticsTools {
-        masks: &|progress| {
-            masks::photo_masks(&network, photos, seeds, &settings, progress, watch.cancel)
-        },
+        masks: &|give| masks::each_photo(&network, photos, seeds, &settings, give, watch.cancel),
         prepare: &|crops| towers.prepare(crops),
         embed: &|prepared| towers.embed_prepared(prepared),
         dim: towers.manifest().dim,
@@ -175,7 +202,7 @@ pub fn label_photos(
     let mut labelled = std::thread::scope(|scope| {
         // What the first text is compared with, meanwhile; a failure is told to the text.
         (method.preset == Preset::Default).then(|| scope.spawn(|| towers.rivals()));
-        label_photos_with(&tools, photos, method, watch)
+        label_photos_with(&tools, photos, known, method, watch)
     })?;
     labelled.report.bundle_sha256 = pipeline.bundle.sha256().to_owned();
     labelled.report.execution_provider = towers.provider().name().to_owned();
@@ -194,46 +221,28 @@ pub fn understand_with<P: Send>(
     watch: Watch<'_>,
 ) -> Result<Semantics> {
     check_input(input)?;
-    label_photos_with(tools, input.photos, method, watch)?.label_gaussians(input, watch)
+    label_photos_with(tools, input.photos, None, method, watch)?.label_gaussians(input, watch)
 }
 
+/// Labels `photos`, which come after those of `known`.
 fn label_photos_with<P: Send>(
     tools: &SemanticsTools<'_, P>,
     photos: &[PosedPhoto],
+    known: Option<&LabelledPhotos>,
     method: &Method,
     watch: Watch<'_>,
 ) -> Result<LabelledPhotos> {
     let mut stages = Stages::new(watch);
-    let masks = stages.run(Stage::Masks, || {
-        (tools.masks)(&|fraction| (watch.progress)(Stage::Masks, fraction))
-    })?;
-    if masks.len() != photos.len() {
-        return Err(Error::internal(format!(
-            "masks of {} photos, not of {}",
-            masks.len(),
-            photos.len()
-        )));
-    }
-    let embedded = stages.run(Stage::Embed, || {
-        let crops: usize = masks.iter().map(|of| of.masks.len()).sum();
-        let shown = masks.iter().filter(|of| !of.masks.is_empty()).count();
-        let whole = tools.context.map_or(0, |_| CROPS_A_PHOTO * shown);
-        let step = |done| {
-            (watch.progress)(Stage::Embed, fraction(done, crops + whole));
-            unless_cancelled(watch.cancel)
-        };
-        let mut found = embed(tools, photos, &masks, &step)?;
-        if let Some(context) = &tools.context {
-            let step = |seen| step(crops + CROPS_A_PHOTO * seen);
-            add_contexts(&mut found, tools.dim, context, photos, &masks, &step)?;
-        }
-        Ok(found)
-    })?;
+    let (masks, embedded) = masks_and_embeddings(tools, photos, &mut stages)?;
+    let (masks, embedded) = match known {
+        Some(known) => known.with(masks, embedded),
+        None => (masks, embedded),
+    };
     let clusters = match method.tracks {
         true => None,
         false => Some(stages.run(Stage::Bank, || {
             let wanted = match method.bank_rows as usize {
-                0 => semantics::rows_wanted(embedded.of.len(), photos.len(), method.lambda),
+                0 => semantics::rows_wanted(embedded.of.len(), masks.len(), method.lambda),
                 rows => rows,
             };
             semantics::bank(&embedded.rows, tools.dim, wanted)
@@ -248,8 +257,67 @@ fn label_photos_with<P: Send>(
     Ok(LabelledPhotos { masks, embedded, dim: tools.dim, clusters, report })
 }
 
+/// The stages `masks` and `embed`. What is embedded while masks are found is part of the first.
+fn masks_and_embeddings<P: Send>(
+    tools: &SemanticsTools<'_, P>,
+    photos: &[PosedPhoto],
+    stages: &mut Stages<'_>,
+) -> Result<(Vec<PhotoMasks>, Embedded)> {
+    let (watch, total) = (stages.watch, AtomicUsize::new(0));
+    // Says nothing before it is known how much there is to do.
+    let step = |done: usize| {
+        match total.load(Ordering::Acquire) {
+            0 => {}
+            total => (watch.progress)(Stage::Embed, fraction(done, total)),
+        }
+        unless_cancelled(watch.cancel)
+    };
+    std::thread::scope(|scope| {
+        let (sent, taken) = mpsc::channel();
+        let embedder = scope.spawn(|| {
+            let mut embedding = Embedding::new(tools, photos, &step);
+            let mut early = BTreeMap::new();
+            for (photo, masks) in taken {
+                early.insert(photo, masks);
+                while let Some(next) = early.remove(&embedding.masks.len()) {
+                    embedding.add(next)?;
+                }
+            }
+            embedding.finish()
+        });
+        let (told, asked) = (AtomicUsize::new(0), AtomicUsize::new(0));
+        let found = stages.run(Stage::Masks, || {
+            (tools.masks)(&|photo, masks: PhotoMasks| {
+                let whole = match tools.context {
+                    Some(_) if !masks.masks.is_empty() => CROPS_A_PHOTO,
+                    _ => 0,
+                };
+                asked.fetch_add(masks.masks.len() + whole, Ordering::Relaxed);
+                let told = told.fetch_add(1, Ordering::Relaxed) + 1;
+                (watch.progress)(Stage::Masks, fraction(told, photos.len()));
+                // Where nobody takes them, the embedder has failed, and says why.
+                let unwanted = |_| Error::new(ErrorCode::Cancelled, "the masks are not wanted");
+                sent.send((photo, masks)).map_err(unwanted)
+            })
+        });
+        drop(sent);
+        let rest = || {
+            total.store(asked.load(Ordering::Relaxed), Ordering::Release);
+            embedder.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+        };
+        let embedded = if found.is_ok() { stages.run(Stage::Embed, rest) } else { rest() };
+        let (masks, embedded) = embedded?;
+        found?;
+        if masks.len() != photos.len() {
+            let (masks, photos) = (masks.len(), photos.len());
+            return Err(Error::internal(format!("masks of {masks} photos, not of {photos}")));
+        }
+        Ok((masks, embedded))
+    })
+}
+
 /// The meaning of a scene's photos: their masks and what each one looks like.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct LabelledPhotos {
     masks: Vec<PhotoMasks>,
     embedded: Embedded,
@@ -262,6 +330,43 @@ pub struct LabelledPhotos {
 }
 
 impl LabelledPhotos {
+    /// Photos that it is of.
+    #[must_use]
+    pub fn photos(&self) -> usize {
+        self.masks.len()
+    }
+
+    /// Bytes of its embeddings and maps.
+    #[must_use]
+    pub fn size_bytes(&self) -> u64 {
+        let maps: usize = self.masks.iter().map(|of| of.map.index.len()).sum();
+        (4 * self.embedded.rows.len() + 2 * maps) as u64
+    }
+
+    /// The same of the photos of these numbers alone, ascending.
+    #[must_use]
+    pub fn only(&self, kept: &[usize]) -> Self {
+        let mut embedded = Embedded::default();
+        let rows = self.embedded.rows.chunks_exact(self.dim.max(1));
+        for (&[photo, mask], row) in self.embedded.of.iter().zip(rows) {
+            if let Some(number) = kept.iter().position(|&one| one == photo) {
+                embedded.of.push([number, mask]);
+                embedded.rows.extend_from_slice(row);
+            }
+        }
+        let masks = kept.iter().map(|&i| self.masks[i].clone()).collect();
+        Self { masks, embedded, clusters: None, dim: self.dim, report: self.report.clone() }
+    }
+
+    /// Masks and embeddings of these photos, then those of photos after them.
+    fn with(&self, masks: Vec<PhotoMasks>, more: Embedded) -> (Vec<PhotoMasks>, Embedded) {
+        let before = self.masks.len();
+        let mut embedded = self.embedded.clone();
+        embedded.rows.extend(more.rows);
+        embedded.of.extend(more.of.into_iter().map(|[photo, mask]| [before + photo, mask]));
+        (self.masks.iter().cloned().chain(masks).collect(), embedded)
+    }
+
     /// Gives it to the scene that was made of these photos: the last stage.
     ///
     /// # Errors
@@ -323,7 +428,7 @@ pub(super) fn check_input(input: &SemanticsInput<'_>) -> Result<()> {
 }
 
 /// Embeddings of all masks that have one.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 struct Embedded {
     /// `[count * dim]`.
     rows: Vec<f32>,
@@ -331,86 +436,127 @@ struct Embedded {
     of: Vec<[usize; 2]>,
 }
 
-/// Cuts and embeds the masks of all photos, a batch at a time; only the last batch is not full. A
-/// mask without pixels, or whose embedding has no length, has no meaning and stays background.
-/// `step` is told how many crops are done.
-fn embed<P: Send>(
-    tools: &SemanticsTools<'_, P>,
-    photos: &[PosedPhoto],
-    masks: &[PhotoMasks],
-    step: &dyn Fn(usize) -> Result<()>,
-) -> Result<Embedded> {
-    let mut found = Embedded::default();
-    let both = photos.par_iter().zip(masks);
-    let cutters: Vec<_> = both.map(|(posed, of)| Cutter::new(&posed.photo, of)).collect();
-    let of_photo = |(photo, of): (usize, &PhotoMasks)| (0..of.masks.len()).map(move |k| [photo, k]);
-    let all: Vec<[usize; 2]> = masks.iter().enumerate().flat_map(of_photo).collect();
-    let size = tools.batch.max(1);
-    let cut = |&[photo, k]: &[usize; 2]| {
-        Some(([photo, k], cutters[photo].cut(k, tools.crop_margin, tools.crop_shape)?))
-    };
-    let prepare = |batch: &[[usize; 2]]| {
-        let (of, crops): (Vec<_>, Vec<Crop>) = batch.par_iter().filter_map(cut).unzip();
-        let prepared = (!crops.is_empty()).then(|| (tools.prepare)(&crops));
-        (of, prepared)
-    };
-    let batches: Vec<&[[usize; 2]]> = all.chunks(size).collect();
-    let mut next = batches.first().map(|batch| prepare(batch));
-    for (i, batch) in batches.iter().enumerate() {
-        step(i * size)?;
-        let (of, prepared) = next.take().unwrap_or_else(|| prepare(batch));
-        let rows = std::thread::scope(|scope| {
-            let ahead = batches.get(i + 1).map(|batch| scope.spawn(|| prepare(batch)));
-            let rows = prepared.as_ref().map_or(Ok(Vec::new()), tools.embed);
-            // One that panicked is prepared again, and panics where it can be seen.
-            next = ahead.and_then(|ahead| ahead.join().ok());
-            rows
-        })?;
-        if rows.len() != of.len() * tools.dim {
-            return Err(Error::internal(format!(
-                "semantics: {} numbers for {} crops of {}",
-                rows.len(),
-                of.len(),
-                tools.dim
-            )));
-        }
-        for (of, row) in of.into_iter().zip(rows.chunks_exact(tools.dim.max(1))) {
-            if row.iter().any(|v| *v != 0.0) {
-                found.rows.extend_from_slice(row);
-                found.of.push(of);
-            }
-        }
-    }
-    Ok(found)
+/// Embeds the masks of photos, which come in their order. A mask without pixels, or whose embedding
+/// has no length, has no meaning and stays background.
+struct Embedding<'a, P> {
+    tools: &'a SemanticsTools<'a, P>,
+    photos: &'a [PosedPhoto],
+    /// Told how much is done, in crops.
+    step: &'a (dyn Fn(usize) -> Result<()> + Sync),
+    done: usize,
+    /// Of the photos so far.
+    masks: Vec<PhotoMasks>,
+    /// Photo and number of masks that do not fill a batch yet.
+    waiting: Vec<[usize; 2]>,
+    found: Embedded,
+    /// `[masks * dim]` of each photo; empty where none weighs something.
+    contexts: Vec<Vec<f32>>,
 }
 
-/// Adds to the embedding of each mask its context in the whole photo. A photo none of whose masks
-/// has a context that weighs something is not looked at. `step` is told how many photos are done.
-fn add_contexts(
-    found: &mut Embedded,
-    dim: usize,
-    context: &Context<'_>,
-    photos: &[PosedPhoto],
-    masks: &[PhotoMasks],
-    step: &dyn Fn(usize) -> Result<()>,
-) -> Result<()> {
-    let weight = |photo: usize, k: usize| (context.weight)(masks[photo].masks[k].area);
-    let mut rows = found.rows.chunks_exact_mut(dim.max(1));
-    for (seen, of) in found.of.chunk_by(|a, b| a[0] == b[0]).enumerate() {
-        step(seen)?;
-        let rows: Vec<&mut [f32]> = rows.by_ref().take(of.len()).collect();
-        if of.iter().all(|&[photo, k]| weight(photo, k) <= 0.0) {
-            continue;
-        }
-        let photo = of[0][0];
-        let Some(features) = (context.dense)(&photos[photo].photo)? else { return Ok(()) };
-        let contexts = semantics::contexts(&features, &masks[photo]);
-        for (row, &[photo, k]) in rows.into_iter().zip(of) {
-            let own = contexts.get(k * dim..(k + 1) * dim).unwrap_or_default();
-            semantics::add_context(row, own, weight(photo, k));
-        }
+impl<'a, P: Send> Embedding<'a, P> {
+    fn new(
+        tools: &'a SemanticsTools<'a, P>,
+        photos: &'a [PosedPhoto],
+        step: &'a (dyn Fn(usize) -> Result<()> + Sync),
+    ) -> Self {
+        let (masks, waiting, contexts) = (Vec::new(), Vec::new(), Vec::new());
+        let found = Embedded::default();
+        Self { tools, photos, step, done: 0, masks, waiting, found, contexts }
     }
-    Ok(())
+
+    /// The next photo: its masks are embedded as far as they fill batches.
+    fn add(&mut self, masks: PhotoMasks) -> Result<()> {
+        let photo = self.masks.len();
+        self.waiting.extend((0..masks.masks.len()).map(|k| [photo, k]));
+        self.masks.push(masks);
+        let whole = self.waiting.len() - self.waiting.len() % self.tools.batch.max(1);
+        let rest = self.waiting.split_off(whole);
+        let batches = std::mem::replace(&mut self.waiting, rest);
+        self.embed(&batches)?;
+        let contexts = self.contexts_of(photo)?;
+        self.contexts.push(contexts);
+        Ok(())
+    }
+
+    /// The rest, and the contexts added to all.
+    fn finish(mut self) -> Result<(Vec<PhotoMasks>, Embedded)> {
+        let rest = std::mem::take(&mut self.waiting);
+        self.embed(&rest)?;
+        let dim = self.tools.dim.max(1);
+        if let Some(context) = &self.tools.context {
+            let rows = self.found.rows.chunks_exact_mut(dim);
+            for (row, &[photo, k]) in rows.zip(&self.found.of) {
+                let weight = (context.weight)(self.masks[photo].masks[k].area);
+                let own = self.contexts[photo].get(k * dim..(k + 1) * dim).unwrap_or_default();
+                semantics::add_context(row, own, weight);
+            }
+        }
+        Ok((self.masks, self.found))
+    }
+
+    /// Cuts and embeds masks, a batch at a time.
+    fn embed(&mut self, all: &[[usize; 2]]) -> Result<()> {
+        let (tools, first) = (self.tools, all.first().map_or(0, |of| of[0]));
+        let shown = all.last().map_or(0, |of| of[0] + 1);
+        let both = self.photos.par_iter().zip(&self.masks).take(shown).skip(first);
+        let cutters: Vec<_> = both.map(|(posed, of)| Cutter::new(&posed.photo, of)).collect();
+        let cut = |&[photo, k]: &[usize; 2]| {
+            let crop = cutters[photo - first].cut(k, tools.crop_margin, tools.crop_shape)?;
+            Some(([photo, k], crop))
+        };
+        let prepare = |batch: &[[usize; 2]]| {
+            let (of, crops): (Vec<_>, Vec<Crop>) = batch.par_iter().filter_map(cut).unzip();
+            let prepared = (!crops.is_empty()).then(|| (tools.prepare)(&crops));
+            (of, prepared)
+        };
+        let batches: Vec<&[[usize; 2]]> = all.chunks(tools.batch.max(1)).collect();
+        let mut next = batches.first().map(|batch| prepare(batch));
+        for (i, batch) in batches.iter().enumerate() {
+            (self.step)(self.done)?;
+            let (of, prepared) = next.take().unwrap_or_else(|| prepare(batch));
+            let rows = std::thread::scope(|scope| {
+                let ahead = batches.get(i + 1).map(|batch| scope.spawn(|| prepare(batch)));
+                let rows = prepared.as_ref().map_or(Ok(Vec::new()), tools.embed);
+                // One that panicked is prepared again, and panics where it can be seen.
+                next = ahead.and_then(|ahead| ahead.join().ok());
+                rows
+            })?;
+            if rows.len() != of.len() * tools.dim {
+                return Err(Error::internal(format!(
+                    "semantics: {} numbers for {} crops of {}",
+                    rows.len(),
+                    of.len(),
+                    tools.dim
+                )));
+            }
+            for (of, row) in of.into_iter().zip(rows.chunks_exact(tools.dim.max(1))) {
+                if row.iter().any(|v| *v != 0.0) {
+                    self.found.rows.extend_from_slice(row);
+                    self.found.of.push(of);
+                }
+            }
+            self.done += batch.len();
+        }
+        Ok(())
+    }
+
+    /// The contexts of a photo's masks in the whole photo. One none of whose masks has a context
+    /// that weighs something is not looked at.
+    fn contexts_of(&mut self, photo: usize) -> Result<Vec<f32>> {
+        let (Some(context), masks) = (self.tools.context, &self.masks[photo]) else {
+            return Ok(Vec::new());
+        };
+        let mut contexts = Vec::new();
+        if masks.masks.iter().any(|mask| (context.weight)(mask.area) > 0.0) {
+            (self.step)(self.done)?;
+            let features = (context.dense)(&self.photos[photo].photo)?;
+            contexts = features.map_or_else(Vec::new, |of| semantics::contexts(&of, masks));
+        }
+        if !masks.masks.is_empty() {
+            self.done += CROPS_A_PHOTO;
+        }
+        Ok(contexts)
+    }
 }
 
 /// The bank, what the photos say, and the row of each mask.

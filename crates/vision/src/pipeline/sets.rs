@@ -33,6 +33,31 @@ impl PhotoSet {
     pub fn size_bytes(&self) -> u64 {
         self.photos.iter().map(|posed| bytes_of(&posed.photo)).sum()
     }
+
+    /// These photos, then those of `more`, whose stages and warnings are the newest. A photo of
+    /// `more` takes the place of one of its name.
+    #[must_use]
+    pub fn joined(mut self, more: Self) -> Self {
+        self.photos.retain(|one| !more.photos.iter().any(|other| other.file == one.file));
+        self.photos.extend(more.photos);
+        self.warnings.extend(more.warnings);
+        Self { stages: more.stages, ..self }
+    }
+
+    /// The photos of these files, in their order; `None` where one is not there.
+    #[must_use]
+    pub fn only<'f>(&self, files: impl Iterator<Item = &'f str>) -> Option<Self> {
+        let of = |file: &str| self.photos.iter().find(|posed| posed.file == file).cloned();
+        let photos = files.map(of).collect::<Option<_>>()?;
+        let (warnings, stages) = (self.warnings.clone(), self.stages.clone());
+        Some(Self { photos, warnings, stages, cameras: self.cameras.clone() })
+    }
+
+    /// Whether they are the photos of these cameras, in their order.
+    #[must_use]
+    pub fn is_of(&self, cameras: &[SceneCamera]) -> bool {
+        self.photos.iter().map(|posed| &posed.file).eq(cameras.iter().map(|camera| &camera.file))
+    }
 }
 
 fn bytes_of(photo: &Photo) -> u64 {

@@ -1,0 +1,251 @@
+//! A scene whose photos change: photos join it, or leave it. Only sets with photos that are new go
+//! through the network; what it said of all others is kept ([`Seen`]), and one scene is made of all
+//! of it again.
+//!
+//! A scene that was refined is not made again: it would fall back behind its steps. It keeps its
+//! Gaussians, and those of the new photos join where no photo before saw anything ([`version`]).
+
+use rayon::prelude::*;
+use segsplat_render::{
+    Kinds, RenderRequest, Renderer,
+    plan::{default_near, widened},
+};
+
+use super::{
+    PhotoSet, Pipeline, Reconstruction, Seen, Stages, lifted, of_sets, see, united, views_of,
+    with_reading,
+};
+use crate::{
+    capture, center_of,
+    error::{Error, Result},
+    lift::{Fusion, UnionOptions},
+    scene::{
+        Camera, Gaussians, HealthReport, PosedPhoto, Scene, SceneCamera, SceneMeta, SceneOptions,
+        Stage, Watch,
+    },
+    seen_at,
+};
+
+/// Longer side of the pictures that say what the photos of a scene saw, pixels.
+const LOOK_SIDE: u32 = 160;
+/// How far behind a surface, as a share of its depth, a Gaussian must be to be hidden by it.
+const BEHIND: f64 = 0.05;
+/// Longer side of the pictures for which Gaussians get the blur of magnification for good: that of
+/// a refinement.
+const LEARNT_SIDE: u32 = 640;
+
+/// What the networks make of photos some of which are new.
+#[derive(Clone, Debug)]
+pub struct Grown {
+    /// The scene of all of them.
+    pub made: Reconstruction,
+    /// One set of Gaussians of the new ones alone.
+    pub of_new: Gaussians,
+    /// What the network said of all of them, where it can be united again.
+    pub seen: Option<Seen>,
+}
+
+impl Seen {
+    /// Photos that it is of.
+    #[must_use]
+    pub fn photos(&self) -> usize {
+        self.capture.near_far.len()
+    }
+
+    /// The same of the photos of these numbers alone, ascending. What the network said of them with
+    /// the help of the others stays.
+    #[must_use]
+    pub fn only(&self, kept: &[usize]) -> Self {
+        let number = |photo: usize| kept.iter().position(|&i| i == photo);
+        let mut seen = self.clone();
+        seen.views.retain_mut(|view| {
+            let new = number(usize::from(view.photo)).and_then(|new| u16::try_from(new).ok());
+            view.photo = new.unwrap_or_default();
+            new.is_some()
+        });
+        for set in &mut seen.sets {
+            set.views = set.views.iter().filter_map(|&view| number(view)).collect();
+        }
+        let capture = &mut seen.capture;
+        capture.near_far = kept.iter().map(|&i| capture.near_far[i]).collect();
+        let row = |&i: &usize| kept.iter().map(|&j| self.capture.overlap[i][j]).collect();
+        capture.overlap = kept.iter().map(row).collect();
+        seen.stages.clear();
+        seen
+    }
+}
+
+/// A scene of photos of which the first `before` were there already; `known` is what the network
+/// said of these, where that is still known.
+///
+/// # Errors
+/// As [`super::reconstruct`]; `invalid_request` also where none of the new photos shows anything
+/// that another one shows.
+pub fn make_more(
+    pipeline: &Pipeline,
+    photos: &PhotoSet,
+    before: usize,
+    known: Option<Seen>,
+    options: &SceneOptions,
+    watch: Watch<'_>,
+) -> Result<Grown> {
+    let all = &photos.photos;
+    let seen = match known.filter(|known| known.photos() == before) {
+        Some(known) if before == all.len() => known,
+        Some(known) => see_more(pipeline, all, known, options, watch)?,
+        None => see(pipeline, all, options, watch)?,
+    };
+    let new = seen.views.iter().filter(|view| usize::from(view.photo) >= before);
+    let new: Vec<_> = new.cloned().collect();
+    if new.is_empty() && before < all.len() {
+        return Err(Error::invalid(
+            "none of the new photos shows what a photo of the scene shows; are their poses in the \
+             scene's own frame?",
+        ));
+    }
+    let fusion = Fusion::OneSet(UnionOptions::default());
+    let of_new = lifted(pipeline, all, new, &seen.method, &fusion, watch)?.gaussians;
+    let made = united(pipeline, all, seen.clone(), watch)?;
+    Ok(Grown { made: with_reading(made, photos), of_new, seen: Some(seen) })
+}
+
+/// What the network says of photos the first of which it has seen.
+fn see_more(
+    pipeline: &Pipeline,
+    photos: &[PosedPhoto],
+    known: Seen,
+    options: &SceneOptions,
+    watch: Watch<'_>,
+) -> Result<Seen> {
+    let mut stages = Stages::new(watch);
+    let manifest = pipeline.geometry.manifest();
+    let views = views_of(manifest, options, photos.len())?;
+    let before = known.photos();
+    let (capture, sets) = stages.run(Stage::Capture, || {
+        pipeline.workers.install(|| {
+            let capture = capture::analyse_more(photos, &known.capture, watch.cancel)?;
+            let most = manifest.neighbors_max;
+            let sets = capture::more_view_sets(&capture, photos, before, views, most);
+            Ok((capture, sets))
+        })
+    })?;
+    let more = stages.run(Stage::Geometry, || of_sets(pipeline, photos, &capture, &sets, watch))?;
+    // Photos that were there before stay as they were.
+    let new = more.into_iter().filter(|view| usize::from(view.photo) >= before);
+    let (views, sets) = (known.views.into_iter().chain(new), known.sets.into_iter().chain(sets));
+    let (views, sets) = (views.collect(), sets.collect());
+    Ok(Seen { views, capture, sets, method: known.method, stages: stages.times })
+}
+
+/// The version of the scene `served` after its photos changed: those of the numbers `kept` are the
+/// first ones of `grown`, all others of `served` are gone.
+///
+/// # Errors
+/// Those of the renderer; `internal` where they are not photos of this scene.
+pub fn version(
+    renderer: &dyn Renderer,
+    served: &Scene,
+    kept: &[usize],
+    grown: &Grown,
+) -> Result<Reconstruction> {
+    let made = &grown.made;
+    let refined = served.meta.report.refinement.as_ref().is_some_and(|of| of.steps > 0);
+    if !refined {
+        return Ok(made.clone());
+    }
+    let gaussians = renumbered(&served.gaussians, kept)?;
+    let mut cameras: Vec<SceneCamera> =
+        kept.iter().filter_map(|&i| served.meta.cameras.get(i)).cloned().collect();
+    let meta = |cameras: Vec<SceneCamera>, report: HealthReport| SceneMeta {
+        cameras,
+        report,
+        ..served.meta.clone()
+    };
+    let gaussians = match grown.of_new.is_empty() {
+        true => gaussians,
+        false => {
+            let as_made = meta(made.cameras.clone(), made.report.clone());
+            let of_scene = Scene::new(as_made, Gaussians::default(), made.backdrop.clone());
+            let new = widened(&of_scene, &grown.of_new, Some(LEARNT_SIDE))?;
+            let near = default_near(served.meta.report.median_depth);
+            let looks = looks(renderer, &gaussians, &cameras, near)?;
+            let is_new: Vec<bool> = (0..new.len())
+                .into_par_iter()
+                .map(|i| !looks.iter().any(|look| look.sees(&new, i)))
+                .collect();
+            gaussians.joined(&new.only(|i| is_new[i]))?
+        }
+    };
+    cameras.extend(made.cameras.iter().skip(kept.len()).cloned());
+    let report = HealthReport {
+        photos: made.report.photos,
+        views_used: made.report.views_used,
+        gaussians: gaussians.len() as u64,
+        overlap: made.report.overlap,
+        network_focal_px: made.report.network_focal_px.clone(),
+        stages: made.report.stages.clone(),
+        warnings: made.report.warnings.clone(),
+        ..served.meta.report.clone()
+    };
+    Ok(Reconstruction { gaussians, backdrop: (*served.backdrop).clone(), report, cameras })
+}
+
+/// The Gaussians of the photos `kept`, whose numbers are their places there.
+fn renumbered(gaussians: &Gaussians, kept: &[usize]) -> Result<Gaussians> {
+    let number = |i: usize| {
+        let photo = usize::from(gaussians.source()[i].view);
+        kept.iter().position(|&one| one == photo)
+    };
+    let mut raw = gaussians.only(|i| number(i).is_some()).into_raw();
+    for source in &mut raw.source {
+        let photo = usize::from(source.view);
+        let new = kept.iter().position(|&one| one == photo).unwrap_or_default();
+        source.view = u16::try_from(new).unwrap_or(u16::MAX);
+    }
+    Gaussians::restore(raw)
+}
+
+/// How far a photo of a scene sees.
+struct Look {
+    camera: Camera,
+    /// `[H * W]` depth, and the opacity of what is there.
+    depth: Vec<f32>,
+    alpha: Vec<f32>,
+}
+
+impl Look {
+    /// Whether the photo saw the place of Gaussian `i`: it is no farther than the surface that the
+    /// photo shows there.
+    fn sees(&self, gaussians: &Gaussians, i: usize) -> bool {
+        let Some((seen, u, v)) = seen_at(&self.camera, center_of(gaussians, i)) else {
+            return false;
+        };
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "inside")]
+        let at = v as usize * self.camera.intrinsics.width as usize + u as usize;
+        let surface = f64::from(self.depth[at]);
+        self.alpha[at] < 0.5 || seen.z <= surface * (1.0 + BEHIND)
+    }
+}
+
+/// What the photos of these cameras see of plain Gaussians.
+fn looks(
+    renderer: &dyn Renderer,
+    gaussians: &Gaussians,
+    cameras: &[SceneCamera],
+    near: f32,
+) -> Result<Vec<Look>> {
+    let kinds = Kinds { color: false, depth: true, alpha: true };
+    let look = |of: &SceneCamera| {
+        let lens = of.camera.intrinsics;
+        let longer = lens.width.max(lens.height);
+        let side = |length: u32| (length * LOOK_SIDE).div_ceil(longer).min(length).max(1);
+        let intrinsics = lens.resized(side(lens.width), side(lens.height));
+        let camera = Camera { intrinsics, ..of.camera };
+        let frame = renderer.render(gaussians, &RenderRequest::plain(camera, kinds, near))?;
+        let lacks = || Error::internal("a renderer gave no depth");
+        let depth = frame.depth.ok_or_else(lacks)?;
+        let alpha = frame.alpha.ok_or_else(lacks)?;
+        Ok(Look { camera, depth, alpha })
+    };
+    cameras.iter().map(look).collect()
+}
