@@ -52,7 +52,7 @@ def edited(page: Page, says: str) -> None:
 
 
 def rows(page: Page) -> list[str]:
-    return [re.sub(r"\s*\(.*|\d[\d,]* Gaussians.*", "", one)
+    return [re.sub(r"\s*\(.*|\d[\d,]* Gaussians.*", "", one).strip()
             for one in page.locator("#edits li > span").all_inner_texts()]
 
 
@@ -98,7 +98,7 @@ def test_what_is_clicked_is_recoloured_and_deleted_by_a_key(
     assert green[1] > 200 and max(green[0], green[2]) < 60, green
     # Clicked again, it is deleted by a key; two presses undo both.
     room.locator("#view").click(position={"x": 640, "y": 400})
-    expect(room.locator("#act-on")).to_have_text("thing 1")
+    expect(room.locator("#act")).to_be_visible()
     room.focus("#view")
     room.keyboard.press("Delete")
     edited(room, "Deleted: a clicked thing")
@@ -227,6 +227,7 @@ def test_on_a_phone_a_tap_chooses_and_a_tap_deletes(
     page.goto(f"{url}/#scene={scene}")
     settled(page)
     page.touchscreen.tap(195, 390)
+    expect(page.locator("#act")).to_be_visible()
     expect(page.locator("#act-on")).to_have_text("thing 1")
     act = page.locator("#act").bounding_box()
     assert act and act["x"] >= 0 and act["x"] + act["width"] <= 390
