@@ -3,46 +3,63 @@
 const edits = {
   list: [],
   counts: [], // Gaussians that each took
+  uncovered: 0, // share of the photos that shows nothing now
   past: [], // lists before this one, and those that were undone
   future: [],
   turn: 0, // pictures of the scene before it are old
   work: Promise.resolve(),
   forget() {
-    Object.assign(this, { list: [], counts: [], past: [], future: [] });
+    Object.assign(this, { list: [], counts: [], uncovered: 0, past: [], future: [] });
     choose(null);
     showEdits();
   },
 };
+const HOLE = 0.001; // share of the photos from which a hole is said
 // What an edit would take: { name, select, boxes, parts }, boxes as parts of words have them.
 let chosen = null;
 
 // ---- the list -----------------------------------------------------------------------------------
 async function readEdits(id) {
   const kept = await server.json(`/v1/scenes/${id}/edits`);
-  if (state.scene?.id !== id) return;
-  Object.assign(edits, { list: kept.edits, counts: kept.counts });
+  if (state.scene?.id === id) takeEdits(kept);
+}
+
+// Takes what the server says of its list, and the lists before and after it.
+function takeEdits({ edits: list, counts, uncovered }, around = {}) {
+  Object.assign(edits, around, { list, counts, uncovered });
   showEdits();
 }
 
-// Puts what `change` makes of the list that is kept, one change after the other: the list, and the
-// lists before and after it. Null changes nothing.
-function changeEdits(change) {
+// Does one piece of work on the edits after the other, of the scene that is shown.
+function inTurn(work) {
   const { id } = state.scene;
-  edits.work = edits.work.then(async () => {
-    if (state.scene?.id !== id) return;
+  edits.work = edits.work.then(() => state.scene?.id === id && work(id)).catch(failed);
+  return edits.work;
+}
+
+// Puts what `change` makes of the list that is kept: the list, and the lists before and after it.
+// Null changes nothing.
+const changeEdits = (change) =>
+  inTurn(async (id) => {
     const changed = change(edits);
     if (!changed) return;
     say(t('edits.doing'));
     const body = JSON.stringify({ edits: changed.list });
     const kept = await server.json(`/v1/scenes/${id}/edits`, { method: 'PUT', body });
     if (state.scene?.id !== id) return;
-    Object.assign(edits, changed, { list: kept.edits, counts: kept.counts });
-    showEdits();
+    takeEdits(kept, changed);
     await showEdited(id);
   });
-  edits.work = edits.work.catch(failed);
-  return edits.work;
-}
+
+// Shows what others made of the list meanwhile.
+const lookAgain = () =>
+  inTurn(async (id) => {
+    const kept = await server.json(`/v1/scenes/${id}/edits`);
+    const same = JSON.stringify(kept.edits) === JSON.stringify(edits.list);
+    if (same || state.scene?.id !== id) return;
+    takeEdits(kept, { past: [], future: [] });
+    await showEdited(id);
+  });
 
 // A change that can be undone.
 const edit = (change) =>
@@ -74,13 +91,14 @@ async function showEdited(id) {
   await askAgain();
   const last = edits.list.length - 1;
   const what = last < 0 ? t('edits.whole') : said(edits.list[last], edits.counts[last]);
-  say(`${what}\n${shown()}`);
+  const share = (100 * edits.uncovered).toFixed(1);
+  say([what, ...(edits.uncovered < HOLE ? [] : [t('edits.hole', { share })]), shown()].join('\n'));
 }
 
 // What an edit does, in words, and how many Gaussians it took.
 const said = (one, n) => `${deedOf(one)} (${t('gaussians', { n: count(n) })})`;
 function deedOf({ op, select }) {
-  const kind = ['text', 'pick', 'box', 'sphere'].find((key) => select[key]);
+  const kind = ['text', 'point', 'pick', 'box', 'sphere'].find((key) => select[key]);
   let what = kind === 'text' ? select.text : t(`edit.of.${kind}`);
   if (select.parts) what += ` ${select.parts.map((part) => part + 1).join(', ')}`;
   return t(`edit.${op}`, { what });
@@ -130,9 +148,9 @@ let focusOn = null; // the row to which the pressed one goes
 // ---- what is chosen -----------------------------------------------------------------------------
 // A word, all of it or one of its parts, or the thing that was clicked.
 const CUT = 0.5; // relevancy from which a text selects, where no other is given
-function chooseWord({ text, pick, cut, parts }) {
+function chooseWord({ text, point, cut, parts }) {
   const boxes = parts.slice(0, BOXES);
-  if (pick) return choose({ name: text, select: { pick }, boxes });
+  if (point) return choose({ name: text, select: { point }, boxes });
   const select = { text, ...(cut === CUT ? {} : { cut }) };
   choose({ name: text, select, boxes, parts });
 }
@@ -306,6 +324,9 @@ function bindEdits() {
     const color = [1, 3, 5].map((at) => parseInt($('color').value.slice(at, at + 2), 16) / 255);
     act('recolor', { color, amount: Number($('amount').value) });
   };
+  document.addEventListener('visibilitychange', () => {
+    if (!document.hidden && state.scene && !state.alone) lookAgain();
+  });
   addEventListener('keydown', (e) => {
     if (e.target.matches('input, textarea, select') || !state.scene || state.alone) return;
     const key = e.key.toLowerCase(),

@@ -23,9 +23,14 @@ async function clicked(event) {
     if (state.understood) await select(local, null, more);
     return;
   }
-  const lens = { camera_to_world: matrixOf(state.camera), fx: focalOf(state.camera, height) },
-    pixel = { x, y, width, height },
-    query = new URLSearchParams({ ...lens, ...pixel });
+  const query = new URLSearchParams({
+    camera_to_world: matrixOf(state.camera),
+    fx: focalOf(state.camera, height),
+    width,
+    height,
+    x,
+    y,
+  });
   if (state.understood && !state.measuring) {
     for (const name of await namesOffered()) query.append('label', name);
   }
@@ -38,7 +43,7 @@ async function clicked(event) {
   told(
     [t('pick.far', { depth: lengthOf(found.depth) }), ...(fits.length ? [] : [nameless])].join(' '),
   );
-  if (found.entry) await select(found.point, found.entry, more, { camera: lens, ...pixel });
+  if (found.entry) await select(found.point, found.entry, more);
   if (fits.length) $('picked').append(t('pick.like'), ...fits.map(offer));
   const measure = make('button', { type: 'button', textContent: t('measure.here') });
   measure.onclick = () => {
@@ -65,7 +70,7 @@ function offer({ text, relevancy }) {
 // Shows what is at a point as words are shown: all that the scene takes for the same, and a box
 // around what touches the point, with its size. It takes the place of the thing before it, unless
 // `more` things are wanted.
-async function select(point, entry, more, pick) {
+async function select(point, entry, more) {
   const up = axisOf(state.camera),
     right = unit(cross(up, axesOf(state.camera)[2]));
   const scene = state.scene,
@@ -78,14 +83,14 @@ async function select(point, entry, more, pick) {
   show({
     text: t('thing', { n: state.things }),
     isThing: true,
-    pick,
+    point,
     scores,
     entries: [found.entry],
     gaussians: found.gaussians,
     parts: [{ ...found, score: 1 }],
     score: 1,
   });
-  if (pick) chooseWord(state.words.at(-1));
+  if (!state.alone) chooseWord(state.words.at(-1));
   const [wide, deep, high] = found.size.map(lengthOf);
   $('picked').append(' ', t('pick.size', { wide, high, deep }), ' ');
 }

@@ -1280,7 +1280,7 @@ pub struct SetEditsRequest {
     pub semantics_wait_ms: ::core::option::Option<u64>,
 }
 /// The edits of a scene and what they come to.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SceneEdits {
     /// The list as JSON, as it can be sent again.
     #[prost(string, tag = "1")]
@@ -1291,6 +1291,10 @@ pub struct SceneEdits {
     /// Gaussians of the scene after all of them.
     #[prost(uint64, tag = "3")]
     pub gaussians: u64,
+    /// Share of what the photos showed that has nothing any more, 0 to 1: where no photo saw what is
+    /// behind a thing that is gone.
+    #[prost(double, tag = "4")]
+    pub uncovered: f64,
 }
 /// One view.
 #[derive(Clone, PartialEq, ::prost::Message)]

@@ -10,7 +10,7 @@ use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
     scene::Scene,
-    service::{EditSpec, scene_splats},
+    service::{EditSpec, SceneEdits, scene_splats},
     store::{write_scene_file, write_semantics_file},
 };
 
@@ -66,6 +66,10 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         }
     }
     let (path, count) = (path.display(), took.gaussians);
-    let value = json!({ "output": path.to_string(), "gaussians": count, "counts": took.counts });
-    out.answer(&format!("{path}: {count} Gaussians; the edits took {:?}", took.counts), &value)
+    let SceneEdits { counts, uncovered, .. } = took;
+    let value = json!({ "output": path.to_string(), "gaussians": count, "counts": counts,
+        "uncovered": uncovered });
+    let hole = 100.0 * uncovered;
+    let says = format!("the edits took {counts:?}; {hole:.1} % of the photos show nothing now");
+    out.answer(&format!("{path}: {count} Gaussians; {says}"), &value)
 }

@@ -113,6 +113,23 @@ async fn edits_see_what_those_before_them_left() {
 }
 
 #[tokio::test]
+async fn an_answer_says_how_much_of_the_photos_shows_nothing_now() {
+    let (server, id) = start().await;
+    let hole = async |edits: Value| put(&server, &id, edits).await["uncovered"].as_f64().unwrap();
+    assert_eq!(hole(json!([])).await, 0.0);
+    let painted = json!([{ "op": "recolor", "select": { "text": "photo 0" }, "color": [1, 0, 0] }]);
+    assert_eq!(hole(painted).await, 0.0, "nothing is gone");
+    let one = hole(json!([{ "op": "delete", "select": { "text": "photo 0" } }])).await;
+    let sphere = json!({ "center": [900, 0, 0], "radius": 100 });
+    let far = json!({ "op": "copy", "select": { "text": "photo 0" }, "translation": [900, 0, 0] });
+    let all = json!([far, { "op": "keep", "select": { "sphere": sphere } }]);
+    let all = put(&server, &id, all).await;
+    let whole = all["uncovered"].as_f64().unwrap();
+    assert!(one < whole && whole > 0.9, "{one}, {whole}");
+    assert_eq!(list(&server, &id).await, all, "it is said again");
+}
+
+#[tokio::test]
 async fn a_pick_and_a_part_take_one_thing() {
     let (server, id) = start().await;
     let photo = gaussians_of(&server, &id, "photo 0").await;
@@ -128,6 +145,36 @@ async fn a_pick_and_a_part_take_one_thing() {
     let edits = json!([{ "op": "keep", "select": { "text": "photo 0", "parts": [0] } }]);
     let answer = put(&server, &id, edits).await;
     assert_eq!(answer["gaussians"], json!(photo));
+}
+
+/// The thing at a point is the same one wherever the edit stands in the list.
+#[tokio::test]
+async fn a_point_takes_the_thing_there_and_nothing_where_nothing_is() {
+    let (server, id) = start().await;
+    let walls = async || {
+        let mut counts = Vec::new();
+        for photo in 0..3 {
+            counts.push(gaussians_of(&server, &id, &format!("photo {photo}")).await);
+        }
+        counts
+    };
+    let before = walls().await;
+    let url = "pick?from=0&x=32&y=24&width=64&height=48";
+    let seen: Value = get(&server, &id, url).await.json().await.unwrap();
+    let delete = json!({ "op": "delete", "select": { "point": seen["point"] } });
+    let answer = put(&server, &id, json!([delete])).await;
+    let after = walls().await;
+    let changed: Vec<_> =
+        before.iter().zip(&after).filter(|(before, after)| before != after).collect();
+    assert!(matches!(&changed[..], [(_, 0)]), "{before:?}, {after:?}");
+    let taken = before.iter().sum::<u64>() - after.iter().sum::<u64>();
+    assert_eq!(answer["counts"], json!([taken]), "a wall is connected");
+    let other = json!({ "op": "delete", "select": { "sphere": { "center": [0, 0, 0],
+        "radius": 0.1 } } });
+    let counts = put(&server, &id, json!([other, delete])).await["counts"].clone();
+    assert_eq!(counts[1], json!(taken), "in another order it is the same thing");
+    let far = json!({ "op": "delete", "select": { "point": [900, 0, 0] } });
+    assert_eq!(put(&server, &id, json!([far])).await["counts"], json!([0]));
 }
 
 #[tokio::test]
@@ -210,6 +257,7 @@ async fn bad_edits_are_refused_by_name_value_and_bound_and_change_nothing() {
             "axes": [[1, 0, 0], [1, 0, 0], [0, 0, 1]] } })),
             "axes are off by 1",
         ),
+        (select(json!({ "point": [2e9, 0, 0] })), "edits[0].select.point is"),
         (select(json!({ "text": "photo 0", "parts": [40] })), "edits[0].select.parts has 40"),
         (select(json!({ "pick": { "camera": { "from": 0 }, "x": 9000, "y": 1 } })), "x is 9000"),
         (

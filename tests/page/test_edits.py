@@ -162,6 +162,14 @@ def test_the_list_is_put_in_order_and_the_focus_stays(room: Page, url: str, scen
     assert kept(url, scene)["edits"] == words[:1]
 
 
+def test_what_others_edit_is_shown_when_one_comes_back(room: Page, url: str, scene: str) -> None:
+    all_of_it = room.evaluate("segsplat.drawing.count")
+    told = kept(url, scene, {"edits": [{"op": "delete", "select": {"text": "box"}}]})
+    room.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+    edited(room, "Deleted: box")
+    assert room.evaluate("segsplat.drawing.count") == told["gaussians"] < all_of_it
+
+
 def test_a_list_that_is_refused_changes_nothing(room: Page, url: str, scene: str) -> None:
     room.click("#edit-box")
     for side in ["wide", "high", "deep"]:

@@ -32,7 +32,8 @@ macro_rules! message {
 pub(super) fn edits(found: SceneEdits) -> Result<pb::SceneEdits> {
     let edits_json = serde_json::to_string(&found.edits)
         .map_err(|e| Error::internal("the edits cannot be written").caused_by(e))?;
-    Ok(pb::SceneEdits { edits_json, counts: found.counts, gaussians: found.gaussians })
+    let SceneEdits { counts, gaussians, uncovered, .. } = found;
+    Ok(pb::SceneEdits { edits_json, counts, gaussians, uncovered })
 }
 
 /// A scene and its semantics.

@@ -6,6 +6,7 @@ use super::{
     kept::{EditList, EditedScene},
     resolve::{self, ResolvedEdits},
     spec::{EditSpec, SceneEdits},
+    uncovered::uncovered,
 };
 use crate::{
     error::{Error, Result},
@@ -103,7 +104,7 @@ impl Shared {
             (found.gaussians, found.counts)
         };
         let scene = Arc::new(base.after_edits(gaussians, list.sha256.clone()));
-        Ok(EditedScene { tag, scene, counts: counts.into() })
+        Ok(EditedScene { tag, scene, counts: counts.into(), uncovered: Arc::default() })
     }
 
     /// Keeps a list that is resolved; gives it and the scene after it. Blocks.
@@ -132,13 +133,17 @@ impl Shared {
 
     /// What a list comes to. Blocks.
     fn come_to(&self, list: &EditList, base: &Arc<Scene>) -> Result<SceneEdits> {
-        let (counts, gaussians) = if list.is_empty() {
-            (Vec::new(), base.gaussians.len())
-        } else {
-            let edited = self.apply_edits(&base.meta.id, list, base)?;
-            (edited.counts.to_vec(), edited.scene.gaussians.len())
-        };
-        Ok(SceneEdits { edits: list.specs.clone(), counts, gaussians: gaussians as u64 })
+        let edits = list.specs.clone();
+        if list.is_empty() {
+            let gaussians = base.gaussians.len() as u64;
+            return Ok(SceneEdits { edits, gaussians, ..SceneEdits::default() });
+        }
+        let EditedScene { scene, counts, uncovered: known, .. } =
+            self.apply_edits(&base.meta.id, list, base)?;
+        let (before, after) = (&base.gaussians, &scene.gaussians);
+        let uncovered = *known.get_or_init(|| uncovered(&base.meta.cameras, before, after));
+        let gaussians = after.len() as u64;
+        Ok(SceneEdits { edits, counts: counts.to_vec(), gaussians, uncovered })
     }
 }
 
@@ -151,9 +156,11 @@ impl OfflineService {
         resolve::check(specs, &self.limits)?;
         let found = resolve::resolve(&self.backend, None, &self.limits, scene, specs)?;
         let gaussians = found.gaussians.len() as u64;
+        let uncovered = uncovered(&scene.meta.cameras, &scene.gaussians, &found.gaussians);
         let mut after = scene.after_edits(found.gaussians, String::new());
         after.meta.report.gaussians = gaussians;
-        let took = SceneEdits { edits: specs.to_vec(), counts: found.counts, gaussians };
+        let edits = specs.to_vec();
+        let took = SceneEdits { edits, counts: found.counts, gaussians, uncovered };
         Ok((after, took))
     }
 }

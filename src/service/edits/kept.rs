@@ -2,7 +2,7 @@
 
 use std::{
     collections::HashMap,
-    sync::Arc,
+    sync::{Arc, OnceLock},
     time::{Duration, Instant},
 };
 
@@ -63,6 +63,8 @@ pub(super) struct EditedScene {
     pub(super) tag: String,
     pub(super) scene: Arc<Scene>,
     pub(super) counts: Arc<[u64]>,
+    /// As [`super::SceneEdits`] has it, once it was asked for.
+    pub(super) uncovered: Arc<OnceLock<f64>>,
 }
 
 /// The lists that were read, and the edited scenes in memory.

@@ -9,6 +9,7 @@ mod calls;
 mod kept;
 mod resolve;
 mod spec;
+mod uncovered;
 
 pub(super) use self::kept::{EditList, Edits};
 pub use self::spec::{EditBox, EditOp, EditPick, EditSelection, EditSpec, EditSphere, SceneEdits};

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 
 use super::spec::{Asked, EditSpec};
 use crate::{
@@ -21,6 +21,9 @@ use crate::{
 
 /// How much larger than its Gaussians the box of a part is: what a version may move them by.
 const PART_SLACK: f64 = 1e-3;
+/// How far a point may be from the Gaussian that it takes: largest scales of the Gaussian, and
+/// beside them median depths of the scene.
+const POINT_REACH: [f32; 2] = [2.0, 0.01];
 
 /// Edits that are ready to be applied, and the Gaussians that each took.
 #[derive(Debug)]
@@ -62,6 +65,10 @@ pub(super) fn resolve(
                 let how = ScoringChoice { preset: None, changes: scoring };
                 let scored = SceneTexts::new(backend, semantic(base, &at)?, &how, &[text], find)?;
                 of_text(&scored, base, &editing, parts.as_deref(), limits, &at)?
+            }
+            Asked::Point(point) => {
+                let now = semantic(base, &at)?.scene;
+                of_point(&now.after_edits(editing.gaussians()?, String::new()), point)
             }
             Asked::Pick(asked) => {
                 let now = semantic(base, &at)?.scene;
@@ -131,12 +138,34 @@ fn of_pick(now: &Scene, asked: &PickSpec, limits: &Limits) -> Result<Selected> {
     let (Some(number), Some(entry)) = (picked.gaussian, picked.entry) else {
         return Err(Error::invalid("nothing with a label is at this pixel"));
     };
+    Ok(part_with(now, number, entry))
+}
+
+/// The thing at a point of the world, or nothing where nothing with a label is near.
+fn of_point(now: &Scene, point: DVec3) -> Selected {
+    let gaussians = &now.gaussians;
+    let place = (point - gaussians.origin()).as_vec3();
+    let away = |i: usize| Vec3::from(gaussians.means()[i]).distance(place);
+    let labelled = gaussians.semantic_index().iter().enumerate().filter(|(_, entry)| **entry > 0);
+    let nearest = labelled.min_by(|a, b| away(a.0).total_cmp(&away(b.0)));
+    let reach = |i: usize| {
+        let largest = gaussians.scales()[i].into_iter().fold(0.0, f32::max);
+        POINT_REACH[0] * largest + POINT_REACH[1] * now.meta.report.median_depth as f32
+    };
+    match nearest {
+        Some((i, &entry)) if away(i) <= reach(i) => part_with(now, i as u64, entry),
+        _ => Selected { entries: Some(Vec::new()), ..Selected::default() },
+    }
+}
+
+/// The connected part of an entry that a Gaussian is in.
+fn part_with(now: &Scene, number: u64, entry: u16) -> Selected {
     let all = InstanceOptions { count_min: 1, share_min: 0.0, ..Default::default() };
     let found = instances(now, &[entry], &all);
     let holds = |part: &&Instance| part.gaussians.iter().any(|&i| u64::from(i) == number);
     let within = found.iter().find(holds).map(|part| box_of(part, &now.gaussians));
     let within = within.into_iter().collect();
-    Ok(Selected { entries: Some(vec![entry]), within, ..Selected::default() })
+    Selected { entries: Some(vec![entry]), within, ..Selected::default() }
 }
 
 fn semantic(base: &Arc<Scene>, at: &str) -> Result<SemanticScene> {

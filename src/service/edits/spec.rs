@@ -81,8 +81,8 @@ pub struct EditPick {
     pub height: Option<u32>,
 }
 
-/// Which Gaussians an edit takes: one of `text`, `box`, `sphere` and `pick`. It looks at the scene
-/// as the edits before it leave it.
+/// Which Gaussians an edit takes: one of `text`, `box`, `sphere`, `point` and `pick`. It looks at
+/// the scene as the edits before it leave it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct EditSelection {
@@ -101,6 +101,10 @@ pub struct EditSelection {
     /// What has its centre in a ball.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sphere: Option<EditSphere>,
+    /// The thing at a point of the world, as a pick gives it: the connected part of the nearest
+    /// Gaussian with a label. Nothing where that does not reach the point.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub point: Option<[f64; 3]>,
     /// What is seen at a pixel.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pick: Option<EditPick>,
@@ -145,6 +149,9 @@ pub struct SceneEdits {
     pub counts: Vec<u64>,
     /// Gaussians of the scene after all of them.
     pub gaussians: u64,
+    /// Share of what the photos showed that has nothing any more, 0 to 1: where no photo saw what
+    /// is behind a thing that is gone.
+    pub uncovered: f64,
 }
 
 /// A selection that is checked.
@@ -152,13 +159,15 @@ pub struct SceneEdits {
 pub(super) enum Asked {
     Text { text: String, parts: Option<Vec<u32>>, scoring: ScoringOptions },
     Place(Place),
+    Point(DVec3),
     Pick(Box<PickSpec>),
 }
 
 impl EditSpec {
     /// Whether it needs the scene's semantics.
     pub(super) fn needs_semantics(&self) -> bool {
-        self.select.text.is_some() || self.select.pick.is_some()
+        let EditSelection { text, point, pick, .. } = &self.select;
+        text.is_some() || point.is_some() || pick.is_some()
     }
 
     /// What it does; `at` names it: `edits[3]`.
@@ -217,18 +226,19 @@ impl EditSpec {
 
     /// What it takes; `at` names it.
     pub(super) fn asked(&self, at: &str, limits: &Limits) -> Result<Asked> {
-        let EditSelection { text, parts, cut, r#box, sphere, pick } = &self.select;
+        let EditSelection { text, parts, cut, r#box, sphere, point, pick } = &self.select;
         let at = &format!("{at}.select");
         let given = [
             ("text", text.is_some()),
             ("box", r#box.is_some()),
             ("sphere", sphere.is_some()),
+            ("point", point.is_some()),
             ("pick", pick.is_some()),
         ];
         let named: Vec<_> = given.iter().filter(|(_, is)| *is).map(|(name, _)| *name).collect();
         if named.len() != 1 {
             let has = if named.is_empty() { "none".to_owned() } else { named.join(" and ") };
-            let must = "it must have one of text, box, sphere and pick";
+            let must = "it must have one of text, box, sphere, point and pick";
             return Err(Error::invalid(format!("{at} has {has}; {must}")));
         }
         for (name, is) in [("parts", parts.is_some()), ("cut", cut.is_some())] {
@@ -258,6 +268,10 @@ impl EditSpec {
             lengths(&format!("{at}.sphere.center"), &center)?;
             in_range(&format!("{at}.sphere.radius"), radius, [0.0, LENGTH_MAX])?;
             return Ok(Asked::Place(Place::Sphere { center, radius }));
+        }
+        if let Some(point) = *point {
+            lengths(&format!("{at}.point"), &point)?;
+            return Ok(Asked::Point(DVec3::from(point)));
         }
         let pick = pick.as_ref().ok_or_else(|| Error::internal("a selection without a kind"))?;
         let named = |e: Error| Error::invalid(format!("{at}.pick.camera: {}", e.message()));

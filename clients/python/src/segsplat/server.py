@@ -136,7 +136,7 @@ def local(
     program: str | Path | None = None,
     flags: Sequence[str] = (),
     env: Mapping[str, str] | None = None,
-    start_s: float = 60.0,
+    start_s: float = 120.0,
     **settings: Any,
 ) -> LocalClient:
     """Starts a server on this machine and gives its client. It stops with the client: at the end of
@@ -162,7 +162,7 @@ def local_async(
     program: str | Path | None = None,
     flags: Sequence[str] = (),
     env: Mapping[str, str] | None = None,
-    start_s: float = 60.0,
+    start_s: float = 120.0,
     **settings: Any,
 ) -> AsyncLocalClient:
     """As `local`, for `async with` and `await`."""
