@@ -309,6 +309,7 @@ def _picture(view: Any) -> tuple[dict[str, str], bytes]:
 
 SHAPES: Mapping[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     **{"CreateScene": _scene, "GetScene": _scene, "RefineScene": _scene, "ListScenes": _page},
+    **{"AddPhotos": _scene, "RemovePhoto": _scene},
     **{"WatchScene": _event, "Query": _found, "Models": _models},
     **{"GetEdits": _edits, "SetEdits": _edits},
 }
