@@ -446,7 +446,8 @@ const TABLE = {
       'auseinandergehen. Pfeiltasten drehen, mit Umschalt verschieben sie; W A S D Q E ' +
       'fliegen, + und - gehen näher und weiter weg, Pos1 ist das erste Foto, N und P sind das ' +
       'nächste und das vorige. Ein Klick wählt das Ding dort, mit Umschalt eines dazu, Esc ' +
-      'lässt los. Entf löscht das Gewählte, Strg und Z nimmt eine Änderung zurück. / geht zur Frage, ? zu dieser Hilfe.',
+      'lässt los. Entf löscht das Gewählte, Strg und Z nimmt eine Änderung zurück. / geht zur ' +
+      'Frage, ? zu dieser Hilfe.',
     '拖动旋转，Shift 加拖动平移，Ctrl 加拖动环视，滚轮靠近。单指旋转；双指平移，张开则靠近。' +
       '方向键旋转，加 Shift 平移；W A S D Q E 飞行，+ 和 - 靠近和远离，Home 回到第一张照片，' +
       'N 和 P 为下一张和上一张。点击选中该处物体，Shift 加点击再选一个，Esc 取消。Delete 删除所选，Ctrl 加 Z 撤销。' +

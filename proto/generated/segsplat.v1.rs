@@ -2397,8 +2397,9 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("segsplat.v1.SceneService", "RefineScene"));
             self.inner.unary(req, path, codec).await
         }
-        /// Adds posed photos, in the frame of the scene's own cameras, to a finished scene. First a header,
-        /// then the photos or one archive in pieces. The version before is served until they have joined.
+        /// Adds posed photos, in the frame of the scene's own cameras, to a finished scene. First a
+        /// header, then the photos or one archive in pieces. The version before is served until they have
+        /// joined.
         pub async fn add_photos(
             &mut self,
             request: impl tonic::IntoStreamingRequest<Message = super::AddPhotosRequest>,
@@ -2708,8 +2709,9 @@ pub mod scene_service_server {
             &self,
             request: tonic::Request<super::RefineSceneRequest>,
         ) -> std::result::Result<tonic::Response<super::Scene>, tonic::Status>;
-        /// Adds posed photos, in the frame of the scene's own cameras, to a finished scene. First a header,
-        /// then the photos or one archive in pieces. The version before is served until they have joined.
+        /// Adds posed photos, in the frame of the scene's own cameras, to a finished scene. First a
+        /// header, then the photos or one archive in pieces. The version before is served until they have
+        /// joined.
         async fn add_photos(
             &self,
             request: tonic::Request<tonic::Streaming<super::AddPhotosRequest>>,

@@ -78,7 +78,7 @@ impl Store {
     /// Lets `replica` change the photos of a scene, unless another does; gives the one that does.
     pub(crate) fn begin_growing(&self, id: &SceneId, replica: &str) -> Result<String> {
         let (what, path) = ("change the photos of a scene", growing(id));
-        if self.objects.create(what, path.clone(), replica.as_bytes().to_vec())? {
+        if self.objects.create(what, path, replica.as_bytes().to_vec())? {
             return Ok(replica.to_owned());
         }
         Ok(self.grows_at(id)?.unwrap_or_else(|| replica.to_owned()))

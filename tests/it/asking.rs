@@ -123,7 +123,7 @@ async fn told(door: &mut Door, id: &SceneId) -> Pin<Box<dyn Stream<Item = String
                             return Some((told_by(&data), (answer, text)));
                         }
                     }
-                    text += &String::from_utf8(answer.chunk().await.unwrap()?.to_vec()).unwrap();
+                    text += std::str::from_utf8(&answer.chunk().await.unwrap()?).unwrap();
                 }
             }))
         }

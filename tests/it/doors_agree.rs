@@ -73,8 +73,6 @@ const NOT_ON_THE_COMMAND_LINE: Absent = &[
 ];
 
 const NOT_ON_THE_PAGE: Absent = &[
-    ("get_edits", "the list of edits comes with the page that is being made anew"),
-    ("set_edits", "the list of edits comes with the page that is being made anew"),
     ("refine_scene", "it takes the machine for minutes: an operator or a program asks for it"),
     ("add_photos", "photos join from a program, as a robot takes them"),
     ("remove_photo", "photos leave by a program"),

@@ -245,10 +245,13 @@ async fn a_change_that_fails_says_why_and_those_after_it_go_on() {
     let failed = server.service.get(&id).await.unwrap();
     assert_eq!((failed.version, failed.growth.state), (2, GrowthState::Failed));
     assert_eq!(failed.growth.error.expect("a reason").code, "internal");
-    let objects = std::fs::read_dir(server.data_dir().join(format!("scenes/{id}"))).unwrap();
-    let names = objects.map(|object| object.unwrap().file_name().into_string().unwrap());
-    let kept = names.filter(|name| name.starts_with("added")).count();
-    assert_eq!(kept, 1, "the photos of a change that failed are gone");
+    let folder = server.data_dir().join(format!("scenes/{id}"));
+    eventually("the photos of a change that failed are gone", async || {
+        let objects = std::fs::read_dir(&folder).unwrap();
+        let names = objects.map(|object| object.unwrap().file_name().into_string().unwrap());
+        (names.filter(|name| name.starts_with("added")).count() == 1).then_some(())
+    })
+    .await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -259,7 +262,8 @@ async fn a_scene_that_grows_keeps_its_semantics_and_its_edits() {
     let url = server.url(&format!("/v1/scenes/{id}/edits"));
     let edits = json!([
         { "op": "delete", "select": { "text": "photo 1" } },
-        { "op": "delete", "select": { "box": { "center": [0.0, 0.0, 0.0], "size": [1e-6, 1e-6, 1e-6] } } },
+        { "op": "delete", "select": { "box":
+            { "center": [0.0, 0.0, 0.0], "size": [1e-6, 1e-6, 1e-6] } } },
     ]);
     let put = client().put(&url).json(&json!({ "edits": edits })).send().await.unwrap();
     assert_eq!(put.status(), StatusCode::OK);
@@ -307,7 +311,7 @@ async fn a_scene_that_was_refined_keeps_its_gaussians_and_is_refined_again() {
     let steps = before.refinement.expect("a report").steps;
     assert!(report["refinement"]["steps"].as_u64().unwrap() >= u64::from(steps), "{report}");
     assert!(report["gaussians"].as_u64().unwrap() >= before.gaussians, "none of them is lost");
-    assert!(report["photos"] == 6 && shown.bytes.len() > 0);
+    assert!(report["photos"] == 6 && !shown.bytes.is_empty());
     let again = over(&server, &id).await;
     assert_eq!(again.refinement.state, RefineState::Done, "it was ordered again: {again:?}");
 }
