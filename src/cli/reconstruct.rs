@@ -46,7 +46,8 @@ use crate::{
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
     #[arg(help = format!("Folder of a capture (docs/captures.md has the layouts), a zip or tar of \
-        one, a video where ffmpeg is installed, or a file of Gaussians ({}), which keeps its semantics", splat_titles()))]
+        one, a video where ffmpeg is installed, or a file of Gaussians ({}), which keeps its \
+        semantics", splat_titles()))]
     photos: PathBuf,
     #[arg(short, long, value_name = "FILE")]
     #[arg(help = format!("Scene file to write; with an ending of these that format: {}",

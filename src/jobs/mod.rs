@@ -2,8 +2,8 @@
 //!
 //! A job makes a scene of an upload, or the semantics of a scene, or changes its photos, or refines
 //! it: `KINDS` lists the kinds, each of which is one file with a `JobKind` and its `Work`. In: an
-//! upload, safe in the store before `Jobs::submit` returns. Out: a scene in the store. Invariant: an
-//! acknowledged scene is made, fails with a code, or is cancelled, over any restart.
+//! upload, safe in the store before `Jobs::submit` returns. Out: a scene in the store. Invariant:
+//! an acknowledged scene is made, fails with a code, or is cancelled, over any restart.
 
 mod background;
 mod bell;

@@ -3,8 +3,9 @@
 //! [`Geometry`]: photos with cameras, depth ranges and neighbours to [`ViewGaussians`].
 //! [`MaskNetwork`]: a photo and points in it to masks. [`ImageText`]: crops and texts to embeddings
 //! of one space. [`TextMaskNetwork`]: a photo and a text to masks. [`FeatureNetwork`]: a photo to
-//! keypoints and descriptors. [`MatcherNetwork`]: those of two photos to matches. A network is known only by its `bundle.toml`: names, sizes,
-//! normalisation and frames all come from there. The only module that knows `ort`.
+//! keypoints and descriptors. [`MatcherNetwork`]: those of two photos to matches. A network is
+//! known only by its `bundle.toml`: names, sizes, normalisation and frames all come from there. The
+//! only module that knows `ort`.
 //!
 //! [`ViewGaussians`]: crate::scene::ViewGaussians
 
