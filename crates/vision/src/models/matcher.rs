@@ -73,13 +73,13 @@ impl MatcherNetwork {
             }
         };
         let size = [64, 48];
-        self.matched([&found(9), &found(5)], [size, size])?;
-        self.matched([&found(3), &found(8)], [size, size]).map(drop)
+        self.matched([&found(9), &found(5)], [size, size], usize::MAX)?;
+        self.matched([&found(3), &found(8)], [size, size], usize::MAX).map(drop)
     }
 
     /// The keypoints of two photos of `sizes` (width and height, pixels) that show the same, in the
-    /// order of the first photo's keypoints. Only the first [`MatcherManifest::count`] keypoints of
-    /// a photo are looked at.
+    /// order of the first photo's keypoints. Only the first `count` keypoints of a photo are looked
+    /// at, at most [`MatcherManifest::count`]: the time grows with its square.
     ///
     /// # Errors
     /// `internal` when the network fails, or answers with another shape than its manifest says or
@@ -88,8 +88,10 @@ impl MatcherNetwork {
         &self,
         photos: [&PhotoFeatures; 2],
         sizes: [[u32; 2]; 2],
+        count: usize,
     ) -> Result<Vec<SureMatch>> {
-        let counts = photos.map(|photo| photo.keypoints.len().min(self.manifest.count));
+        let most = self.manifest.count.min(count);
+        let counts = photos.map(|photo| photo.keypoints.len().min(most));
         if counts.contains(&0) {
             return Ok(Vec::new());
         }

@@ -50,6 +50,10 @@ const NAMED_MAX: usize = 4;
 /// How far a match of most similar descriptors is trusted beside those of the network, which are
 /// tried first.
 const NEAREST_TRUST: f32 = 0.5;
+/// Where more pairs are matched, the network looks at fewer keypoints of each photo: time grows with
+/// their square, and of many photos each link matters less (docs/adr/0085).
+const PAIRS_IN_FULL: usize = 36;
+const KEYPOINTS_OF_MANY: usize = 1024;
 /// What can be done about photos whose cameras are not found.
 const REMEDY: &str = "Take more photos, each of which shows most of what the one before shows, of \
     things with texture; or send cameras with them";
@@ -220,12 +224,13 @@ fn matched(
     let pairs = pairs_to_match(photos.len(), alike);
     let least = network.manifest().similarity_min;
     let size = |i: usize| [photos[i].0.width, photos[i].0.height];
+    let count = if pairs.len() > PAIRS_IN_FULL { KEYPOINTS_OF_MANY } else { usize::MAX };
     let done = AtomicUsize::new(0);
     let matched = |&[i, j]: &[usize; 2]| {
         unless_cancelled(cancel)?;
         let nearest = descriptors[i].matched(&descriptors[j], least);
         let sure = match &matcher {
-            Some(matcher) => matcher.matched([&seen[i], &seen[j]], [i, j].map(size))?,
+            Some(matcher) => matcher.matched([&seen[i], &seen[j]], [i, j].map(size), count)?,
             None => Vec::new(),
         };
         let share = fraction(done.fetch_add(1, Ordering::Relaxed), pairs.len());
