@@ -40,7 +40,7 @@ serve: build
 	$(SEGSPLAT) serve $(ARGS)
 
 check: fmt lint setup
-	$(ADAPTER) $(CARGO) test --locked --workspace --lib --test it
+	$(ADAPTER) RUST_TEST_THREADS=$$((2 * $$(nproc))) $(CARGO) test --locked --workspace --lib --test it
 
 test: fmt lint doc tests deny
 

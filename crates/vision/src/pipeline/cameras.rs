@@ -50,8 +50,8 @@ const NAMED_MAX: usize = 4;
 /// How far a match of most similar descriptors is trusted beside those of the network, which are
 /// tried first.
 const NEAREST_TRUST: f32 = 0.5;
-/// Where more pairs are matched, the network looks at fewer keypoints of each photo: time grows with
-/// their square, and of many photos each link matters less (docs/adr/0085).
+/// Where more pairs are matched, the network looks at fewer keypoints of each photo: time grows
+/// with their square, and of many photos each link matters less (docs/adr/0085).
 const PAIRS_IN_FULL: usize = 36;
 const KEYPOINTS_OF_MANY: usize = 1024;
 /// What can be done about photos whose cameras are not found.
