@@ -8,7 +8,7 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::{
     convert::{self, not_empty},
-    pb::{self, create_scene_header::Cameras, create_scene_request::Part},
+    pb::{self, create_scene_header::Cameras},
     status::{logged, unreadable},
 };
 use crate::{
@@ -258,46 +258,19 @@ async fn create(
 }
 
 async fn add_photos(api: Api, mut messages: Streaming<pb::AddPhotosRequest>) -> Result<pb::Scene> {
-    use pb::{add_photos_header::Cameras, add_photos_request::Part};
+    use pb::add_photos_header::Cameras;
     let limits = api.service.limits();
     let mut upload = UploadBuilder::new(&limits, &api.uploads).at_least(1);
-    let mut header = None;
-    loop {
-        let next = messages.message().await.map_err(|status| unreadable(&status))?;
-        let Some(message) = next else { break };
-        let part = message.part.ok_or_else(|| Error::invalid("upload: an empty message"))?;
-        match (part, &header) {
-            (Part::Header(mut first), None) => {
-                // Before the photos are sent.
-                let id: SceneId = first.scene_id.parse()?;
-                api.service.get(&id).await?;
-                let cameras = first.cameras.take().map(|cameras| match cameras {
-                    Cameras::TransformsJson(json) => UploadCameras::Transforms(json.into()),
-                    Cameras::CamerasJson(json) => UploadCameras::Cameras(json.into()),
-                });
-                cameras.map_or(Ok(()), |cameras| upload.begin_cameras(cameras))?;
-                header = Some((id, first));
-            }
-            (Part::Header(_), Some(_)) => {
-                return Err(Error::invalid("upload: a second header"));
-            }
-            (_, None) => {
-                return Err(Error::invalid("upload: the first message must be the header"));
-            }
-            (Part::Photo(piece), Some(_)) => {
-                if !piece.name.is_empty() {
-                    upload.begin_photo(&piece.name)?;
-                }
-                upload.extend(&piece.data)?;
-            }
-            (Part::Archive(piece), Some(_)) => {
-                upload.begin_archive();
-                upload.extend(&piece)?;
-            }
-        }
-    }
-    let nothing = || Error::invalid("upload: no header, nothing was sent");
-    let (id, header) = header.ok_or_else(nothing)?;
+    let mut header = read_header(&mut messages).await?;
+    // Before the photos are sent.
+    let id: SceneId = header.scene_id.parse()?;
+    api.service.get(&id).await?;
+    let cameras = header.cameras.take().map(|cameras| match cameras {
+        Cameras::TransformsJson(json) => UploadCameras::Transforms(json.into()),
+        Cameras::CamerasJson(json) => UploadCameras::Cameras(json.into()),
+    });
+    cameras.map_or(Ok(()), |cameras| upload.begin_cameras(cameras))?;
+    read_pieces(&mut messages, &mut upload).await?;
     let (upload, _guard) = upload.finish()?;
     let request = AddPhotos {
         upload,
@@ -313,43 +286,101 @@ async fn read_upload(
 ) -> Result<(Upload, pb::CreateSceneHeader, UploadGuard)> {
     let limits = api.service.limits();
     let mut upload = UploadBuilder::new(&limits, &api.uploads);
-    let mut header = None;
-    loop {
-        let next = messages.message().await.map_err(|status| unreadable(&status))?;
-        let Some(message) = next else { break };
-        let part = message.part.ok_or_else(|| Error::invalid("upload: an empty message"))?;
-        match (part, &header) {
-            (Part::Header(first), None) => {
-                api.service.has_room(!first.idempotency_key.is_empty())?;
-                header = Some(begin(api, first, &mut upload)?);
-            }
-            (Part::Header(_), Some(_)) => {
-                return Err(Error::invalid("upload: a second header"));
-            }
-            (_, None) => {
-                return Err(Error::invalid("upload: the first message must be the header"));
-            }
-            (Part::Photo(piece), Some(_)) => {
+    let first = read_header(&mut messages).await?;
+    api.service.has_room(!first.idempotency_key.is_empty())?;
+    let header = begin(api, first, &mut upload)?;
+    read_pieces(&mut messages, &mut upload).await?;
+    let (upload, guard) = upload.finish()?;
+    Ok((upload, header, guard))
+}
+
+/// What a message of an upload has: first a header, then pieces of files.
+enum UploadPart<H> {
+    Header(H),
+    Photo(pb::PhotoChunk),
+    Splats(pb::SplatsChunk),
+    Archive(prost::bytes::Bytes),
+}
+
+/// A message of the stream of an upload.
+trait UploadMessage {
+    type Header;
+
+    /// Its part; `None` if it is empty.
+    fn part(self) -> Option<UploadPart<Self::Header>>;
+}
+
+impl UploadMessage for pb::CreateSceneRequest {
+    type Header = pb::CreateSceneHeader;
+
+    fn part(self) -> Option<UploadPart<Self::Header>> {
+        use pb::create_scene_request::Part;
+        Some(match self.part? {
+            Part::Header(header) => UploadPart::Header(header),
+            Part::Photo(piece) => UploadPart::Photo(piece),
+            Part::Splats(piece) => UploadPart::Splats(piece),
+            Part::Archive(piece) => UploadPart::Archive(piece),
+        })
+    }
+}
+
+impl UploadMessage for pb::AddPhotosRequest {
+    type Header = pb::AddPhotosHeader;
+
+    fn part(self) -> Option<UploadPart<Self::Header>> {
+        use pb::add_photos_request::Part;
+        Some(match self.part? {
+            Part::Header(header) => UploadPart::Header(header),
+            Part::Photo(piece) => UploadPart::Photo(piece),
+            Part::Archive(piece) => UploadPart::Archive(piece),
+        })
+    }
+}
+
+/// The next part of an upload; `None` at its end.
+async fn next_part<M: UploadMessage>(
+    messages: &mut Streaming<M>,
+) -> Result<Option<UploadPart<M::Header>>> {
+    let next = messages.message().await.map_err(|status| unreadable(&status))?;
+    let empty = || Error::invalid("upload: an empty message");
+    next.map(|message| message.part().ok_or_else(empty)).transpose()
+}
+
+async fn read_header<M: UploadMessage>(messages: &mut Streaming<M>) -> Result<M::Header> {
+    match next_part(messages).await? {
+        Some(UploadPart::Header(header)) => Ok(header),
+        Some(_) => Err(Error::invalid("upload: the first message must be the header")),
+        None => Err(Error::invalid("upload: no header, nothing was sent")),
+    }
+}
+
+/// Reads all that comes after the header.
+async fn read_pieces<M: UploadMessage>(
+    messages: &mut Streaming<M>,
+    upload: &mut UploadBuilder<'_>,
+) -> Result<()> {
+    while let Some(part) = next_part(messages).await? {
+        match part {
+            UploadPart::Header(_) => return Err(Error::invalid("upload: a second header")),
+            UploadPart::Photo(piece) => {
                 if !piece.name.is_empty() {
                     upload.begin_photo(&piece.name)?;
                 }
                 upload.extend(&piece.data)?;
             }
-            (Part::Splats(piece), Some(_)) => {
+            UploadPart::Splats(piece) => {
                 if !piece.name.is_empty() {
                     upload.begin_splats(&piece.name)?;
                 }
                 upload.extend(&piece.data)?;
             }
-            (Part::Archive(piece), Some(_)) => {
+            UploadPart::Archive(piece) => {
                 upload.begin_archive();
                 upload.extend(&piece)?;
             }
         }
     }
-    let header = header.ok_or_else(|| Error::invalid("upload: no header, nothing was sent"))?;
-    let (upload, guard) = upload.finish()?;
-    Ok((upload, header, guard))
+    Ok(())
 }
 
 /// Checks the header and takes the camera JSON out of it.

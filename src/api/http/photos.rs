@@ -5,7 +5,7 @@ use std::time::Duration;
 use axum::{
     Json,
     extract::{FromRequestParts, RawPathParams, Request},
-    http::{HeaderValue, StatusCode, request::Parts},
+    http::{StatusCode, request::Parts},
     response::{IntoResponse, Response},
 };
 use serde::Deserialize;
@@ -16,7 +16,7 @@ use super::{
     extract::{CallerApi, Id},
     fields::Fields,
     multipart::{ArchiveBody, UploadForm, read_on, read_upload},
-    scenes::{idempotency_key, preferred_wait},
+    scenes::{idempotency_key, preferred_wait, tell_applied, wait_or},
 };
 use crate::{
     api::Api,
@@ -93,20 +93,11 @@ pub(super) async fn add(
     let (upload, _guard) = read_upload(&api, request, &mut fields, 1).await?;
     let PhotosParams { wait_ms } = fields.take()?;
     fields.finish()?;
-    let wait = wait_ms.map(Duration::from_millis);
-    let preferred = preferred.filter(|_| wait.is_none());
-    let wait = wait.or(preferred.map(|seconds| Duration::from_secs(seconds.into())));
+    let (wait, preferred) = wait_or(wait_ms.map(Duration::from_millis), preferred);
     let request = AddPhotos { upload, idempotency_key, wait };
     let added = api.service.add_photos(&id, request).await?;
     let mut answer = changed(added.status).into_response();
-    let headers = answer.headers_mut();
-    if let Some(seconds) = preferred {
-        let applied = HeaderValue::from_str(&format!("wait={seconds}"));
-        applied.map(|value| headers.insert("preference-applied", value)).ok();
-    }
-    if added.replayed {
-        headers.insert("idempotency-replayed", HeaderValue::from_static("true"));
-    }
+    tell_applied(answer.headers_mut(), preferred, added.replayed);
     Ok(answer)
 }
 

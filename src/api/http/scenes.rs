@@ -73,9 +73,7 @@ pub(super) async fn create(
     let least = api.service.limits().photos_min;
     let (upload, _guard) = read_upload(&api, request, &mut fields, least).await?;
     let (options, wait) = options(&api, fields)?;
-    // What the query says counts.
-    let preferred = preferred.filter(|_| wait.is_none());
-    let wait = wait.or(preferred.map(|seconds| Duration::from_secs(seconds.into())));
+    let (wait, preferred) = wait_or(wait, preferred);
     let request = CreateScene { upload, options, idempotency_key, wait, request_id };
     let created = api.service.create_scene(request).await?;
     if let (Some(error), Some(_)) = (&created.status.error, wait) {
@@ -96,13 +94,7 @@ pub(super) async fn create(
     if let Some(value) = times.and_then(|times| HeaderValue::from_str(&times).ok()) {
         answer.headers_mut().insert("server-timing", value);
     }
-    if let Some(seconds) = preferred {
-        let applied = HeaderValue::from_str(&format!("wait={seconds}"));
-        applied.map(|value| answer.headers_mut().insert("preference-applied", value)).ok();
-    }
-    if created.replayed {
-        answer.headers_mut().insert("idempotency-replayed", HeaderValue::from_static("true"));
-    }
+    tell_applied(answer.headers_mut(), preferred, created.replayed);
     Ok(answer)
 }
 
@@ -265,6 +257,27 @@ pub(super) fn preferred_wait(headers: &HeaderMap) -> Option<u32> {
         let is_wait = name.trim().eq_ignore_ascii_case("wait");
         is_wait.then(|| value.trim().trim_matches('"').parse().ok())?
     })
+}
+
+/// How long to wait: what the query says, else what `Prefer` asks for; and the seconds of `Prefer`
+/// where they count.
+pub(super) fn wait_or(
+    query: Option<Duration>,
+    preferred: Option<u32>,
+) -> (Option<Duration>, Option<u32>) {
+    let preferred = preferred.filter(|_| query.is_none());
+    (query.or(preferred.map(|seconds| Duration::from_secs(seconds.into()))), preferred)
+}
+
+/// Tells which seconds of `Prefer` counted, and that the answer is that of an earlier call.
+pub(super) fn tell_applied(headers: &mut HeaderMap, preferred: Option<u32>, replayed: bool) {
+    if let Some(seconds) = preferred {
+        let applied = HeaderValue::from_str(&format!("wait={seconds}"));
+        applied.map(|value| headers.insert("preference-applied", value)).ok();
+    }
+    if replayed {
+        headers.insert("idempotency-replayed", HeaderValue::from_static("true"));
+    }
 }
 
 /// 1 to 255 printable ASCII characters, once.
