@@ -17,19 +17,22 @@ use crate::{
     metrics::{clamped, psnr, ssim},
     photo_files,
     pipeline::{
-        Pipeline,
+        Pipeline, growth,
         refinement::{RefineCalls, refined},
     },
     refine::{ALIGNING_STEPS, RefinedVersion, aligned, held_out},
     refinements::Variant,
     render::{
-        Background, Frame, Kinds, RenderRequest, Switches,
+        Background, Frame, Kinds, RenderRequest, Renderer, Switches,
         plan::{default_near, served},
         train::{pose::moved, unit},
     },
     rows::{Rows, ms, progress},
     scene::{Camera, CameraToWorld, Gaussians, PosedPhoto, Scene, SceneOptions},
-    scenes::{is_posed, make_for_refinement, make_keeping, recast, scene_of, use_of, view_request},
+    scenes::{
+        is_posed, make_for_refinement, make_keeping, make_more, recast, scene_of, spread, use_of,
+        view_request,
+    },
     setup::Inputs,
 };
 
@@ -52,6 +55,9 @@ pub(crate) struct Args {
     /// the median depth
     #[arg(long, num_args = 2, value_names = ["DEGREES", "SHARE"])]
     disturb: Option<Vec<f64>>,
+    /// So many of the given photos join the scene of all others: how good it is before and after
+    #[arg(long, conflicts_with_all = ["refine", "disturb"])]
+    join: Option<usize>,
     /// Folder whose files replace the built-in shaders
     #[arg(long)]
     shaders: Option<PathBuf>,
@@ -76,6 +82,13 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         let (targets, right) = given(&all, args.inputs.photos);
         if right.len() < 2 || targets.is_empty() {
             return Err(Error::invalid(format!("{name}: {} photos are too few", all.len())));
+        }
+        if let Some(count) = args.join {
+            let row = joining(&engine, &*renderer, &right, count, &scene_options, &targets)?;
+            let row = json!({ "scene": name, "use": use_of(&name), "joined": row });
+            progress(&row.to_string());
+            rows.push(json!({ "psnr_db": row["joined"]["psnr"] }), row)?;
+            continue;
         }
         let wrong = args.disturb.as_deref().map(|at| [at[0], at[1]]);
         let mut median_depth = 1.0;
@@ -230,6 +243,53 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// What becomes of a scene when `count` of its photos, spread evenly, join those before: PSNR at the
+/// targets before, after, and of a scene made of all photos at once.
+fn joining(
+    engine: &Pipeline,
+    renderer: &dyn Renderer,
+    photos: &[PosedPhoto],
+    count: usize,
+    options: &SceneOptions,
+    targets: &[PosedPhoto],
+) -> Result<Value> {
+    let new = spread(photos.len(), &[], count);
+    let old: Vec<usize> = (0..photos.len()).filter(|i| !new.contains(i)).collect();
+    let all: Vec<PosedPhoto> = old.iter().chain(&new).map(|&i| photos[i].clone()).collect();
+    let (made, seen) = make_keeping(engine, &all[..old.len()], options)?;
+    let before = scene_of(made);
+    let begun = Instant::now();
+    let grown = make_more(engine, &all, old.len(), seen, options)?;
+    let made_ms = ms(begun);
+    let kept: Vec<usize> = (0..old.len()).collect();
+    let after = scene_of(growth::version(renderer, &before, &kept, &grown, &all)?);
+    let join_ms = ms(begun);
+    let at_once = scene_of(make_keeping(engine, photos, options)?.0);
+    let each = |scene: &Scene| -> Result<Vec<f64>> {
+        let draw = |camera| {
+            let plain = view_request(camera, Kinds::COLOR, scene.meta.report.median_depth);
+            renderer.render(&scene.gaussians, &served(scene, plain))
+        };
+        targets.iter().map(|target| mean_psnr(std::slice::from_ref(target), draw)).collect()
+    };
+    let [had, has, anew] = [each(&before)?, each(&after)?, each(&at_once)?];
+    let united = each(&scene_of(grown.made.clone()))?;
+    let mean = |of: &[f64]| of.iter().sum::<f64>() / of.len() as f64;
+    let lost = had.iter().zip(&has).map(|(had, has)| had - has).fold(f64::MIN, f64::max);
+    Ok(json!({
+        "photos": old.len(),
+        "join": new.len(),
+        "remade": after.gaussians.means() == grown.made.gaussians.means(),
+        "psnr_before": mean(&had),
+        "psnr": mean(&has),
+        "lost_most": lost,
+        "psnr_united": mean(&united),
+        "psnr_at_once": mean(&anew),
+        "made_ms": made_ms,
+        "join_ms": join_ms,
+    }))
 }
 
 /// Photos whose cameras are turned by so many degrees and moved by `way` world units, each about an

@@ -11,7 +11,11 @@ use crate::{
     limits::Limits,
     models::{ResizeFilter, fit},
     photo_files,
-    pipeline::{self, PhotoSet, Pipeline, Reconstruction, Seen, reconstruct},
+    pipeline::{
+        self, PhotoSet, Pipeline, Reconstruction, Seen,
+        growth::{self, Grown},
+        reconstruct,
+    },
     render::{Kinds, RenderRequest, plan::default_near},
     rows::means,
     scene::{
@@ -162,6 +166,18 @@ pub(crate) fn make_keeping(
 ) -> Result<(Reconstruction, Seen)> {
     let photos = PhotoSet::given(photos.to_vec(), Vec::new(), 0.0);
     pipeline::make_keeping(engine, &photos, options, SILENT)
+}
+
+/// A scene of photos of which the first `before` were there already.
+pub(crate) fn make_more(
+    engine: &Pipeline,
+    photos: &[PosedPhoto],
+    before: usize,
+    known: Seen,
+    options: &SceneOptions,
+) -> Result<Grown> {
+    let photos = PhotoSet::given(photos.to_vec(), Vec::new(), 0.0);
+    growth::make_more(engine, &photos, before, Some(known), options, SILENT)
 }
 
 /// What a refinement without the photos `held` begins with: the scene and its one set.

@@ -341,7 +341,8 @@ impl Jobs {
         let seen = seen.map(|seen| seen.only(&kept));
         let scenes = &self.parts.scenes;
         let grown = scenes.make_more(&photos, kept.len(), seen, &record.options, watch)?;
-        let made = growth::version(&*self.parts.renderer, served, &served_kept, &grown)?;
+        let made =
+            growth::version(&*self.parts.renderer, served, &served_kept, &grown, &photos.photos)?;
         let provenance = changed_provenance(&served.meta.provenance, change, hashes);
         let scene = made.into_scene(id.clone(), served.meta.created_ms, provenance);
         let (semantics, labelled) = match record.status.semantics.state {

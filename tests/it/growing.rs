@@ -8,11 +8,16 @@ use segsplat::{
     api::grpc::pb::{self, scene_service_client::SceneServiceClient},
     config::Config,
     jobs::{PipelineNetworks, SceneNetworks},
-    pipeline::{PhotoSet, Pipeline, growth::make_more, make_keeping},
+    pipeline::{
+        PhotoSet, Pipeline,
+        growth::{self, Grown, make_more},
+        make_keeping,
+    },
+    render::cpu::CpuRenderer,
     sample::{self, SampleOptions},
     scene::{
-        Gaussians, GrowthState, Refine, RefineState, SceneId, SceneOptions, SceneStatus,
-        SemanticsMode, Stage, Upload, UploadCameras, Watch,
+        Gaussians, GrowthState, Provenance, Refine, RefineState, SceneId, SceneOptions,
+        SceneStatus, SemanticsMode, Stage, Upload, UploadCameras, Watch,
     },
     service::CreateScene,
 };
@@ -413,6 +418,37 @@ fn only_sets_with_new_photos_go_through_the_network_and_the_others_stay_as_they_
     runs.store(0, Ordering::Release);
     make_more(&engine, &set(6), 5, None, &options, watch).expect("made");
     assert_eq!(ran(), 2);
+}
+
+#[test]
+fn a_scene_that_would_be_worse_at_its_old_photos_keeps_what_it_has() {
+    let Some(engine) = engine() else { return };
+    let photos = sample::photos(&ALL).expect("the options are in range");
+    let set = |count: usize| PhotoSet::given(photos[..count].to_vec(), Vec::new(), 0.0);
+    let (options, stop) = (SceneOptions::default(), std::sync::atomic::AtomicBool::new(false));
+    let watch = Watch { progress: &|_, _| (), cancel: &stop };
+    let (made, known) = make_keeping(&engine, &set(5), &options, watch).expect("made");
+    let served = made.into_scene(SceneId::from_bytes([7; 16]), 0, Provenance::default());
+    let mut grown = make_more(&engine, &set(6), 5, Some(known), &options, watch).expect("grown");
+    let renderer = CpuRenderer::new(2).expect("a renderer");
+    let version = |grown: &Grown| {
+        growth::version(&renderer, &served, &[0, 1, 2, 3, 4], grown, &photos).expect("a version")
+    };
+    // What the old photos show is what they showed before.
+    grown.made.gaussians = served.gaussians.joined(&grown.of_new.only(|i| i == 0)).unwrap();
+    let good = version(&grown);
+    assert!(good.gaussians.means() == grown.made.gaussians.means(), "the union, made again");
+    assert!(good.report.network_focal_px[5] > 0.0, "the new photo may be in front");
+    // All of it is black.
+    let mut raw = grown.made.gaussians.clone().into_raw();
+    raw.sh.fill([-2.0; 3]);
+    grown.made.gaussians = Gaussians::restore(raw).expect("Gaussians");
+    let kept = version(&grown);
+    let before = served.gaussians.sh();
+    assert!(kept.gaussians.sh()[..before.len()] == *before, "all that it had, in its place");
+    assert_eq!(kept.cameras.len(), 6);
+    assert_eq!(kept.report.network_focal_px[..5], served.meta.report.network_focal_px[..]);
+    assert!(kept.report.network_focal_px[5] <= 0.0, "the new photo never is in front");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -42,8 +42,6 @@ use crate::{
 const NEAR_SHARE: f64 = 0.01;
 /// Near planes accepted, world units.
 pub const NEAR_RANGE: [f32; 2] = [1e-9, 1e9];
-/// What a turn of one radian costs against a step of one median depth.
-const TURN_COST: f64 = 0.5;
 
 /// The near plane of a scene whose median depth is `median_depth`, world units.
 pub fn default_near(median_depth: f64) -> f32 {
@@ -147,12 +145,7 @@ fn behind(scene: &Scene, camera: &Camera, method: ViewMethod) -> Vec<bool> {
     let pose = &camera.camera_to_world;
     let mut costs: Vec<(usize, f64)> = photos
         .filter(|(_, (_, focal))| **focal > 0.0)
-        .map(|(i, (photo, _))| {
-            let own = &photo.camera.camera_to_world;
-            let step = own.center().distance(pose.center()) / depth;
-            let turn = own.axis().dot(pose.axis()).clamp(-1.0, 1.0).acos();
-            (i, step + TURN_COST * turn)
-        })
+        .map(|(i, (photo, _))| (i, photo.camera.camera_to_world.apart(pose, depth)))
         .collect();
     let layered = front > 0 && costs.len() > front && depth > 0.0;
     let mut behind = vec![layered; scene.meta.cameras.len()];

@@ -11,6 +11,8 @@ use crate::{
 
 /// How far a rotation may be from orthonormal (largest number of |R Rᵀ - I|).
 pub const ORTHONORMAL_TOLERANCE: f64 = 1e-3;
+/// What a turn of one radian costs against a step of one median depth.
+const TURN_COST: f64 = 0.5;
 
 /// Pinhole intrinsics in pixels of the image they belong to. The centre of pixel (0, 0) is (0.5,
 /// 0.5); the principal point need not be central.
@@ -286,6 +288,13 @@ impl CameraToWorld {
     /// Unit viewing axis (+z of the camera) in the world.
     pub fn axis(&self) -> DVec3 {
         self.0.z_axis.truncate()
+    }
+
+    /// How far another camera is, where the nearest are looked for: the step between both in units
+    /// of `depth`, world units, and half of the angle between their axes, radians.
+    pub fn apart(&self, other: &Self, depth: f64) -> f64 {
+        let step = self.center().distance(other.center()) / depth;
+        step + TURN_COST * self.axis().dot(other.axis()).clamp(-1.0, 1.0).acos()
     }
 
     /// 16 numbers, row-major.

@@ -29,8 +29,6 @@ use crate::{
 
 /// Pixels that one thread takes at a time.
 pub(super) const PIXELS_A_TASK: usize = 1 << 11;
-/// What a turn of one radian costs against a step of one median depth, in the choice of neighbours.
-const TURN_COST: f64 = 0.5;
 
 /// What hides what, and how many layers a surface may have. Chosen on four real scenes of 9 to 20
 /// photos that are not reported: docs/adr/0034-many-photos.md.
@@ -126,10 +124,7 @@ fn neighbors(surfaces: &[Surface<'_>], count: usize) -> Vec<Vec<usize>> {
     let depth = median(surfaces.par_iter().map(depths).collect());
     let unit = if depth > 0.0 { depth } else { 1.0 };
     let pose = |v: usize| &surfaces[v].view.camera.camera_to_world;
-    let cost = |v: usize, w: usize| {
-        let step = pose(v).center().distance(pose(w).center()) / unit;
-        step + TURN_COST * pose(v).axis().dot(pose(w).axis()).clamp(-1.0, 1.0).acos()
-    };
+    let cost = |v: usize, w: usize| pose(v).apart(pose(w), unit);
     let of = |v: usize| {
         let others = (0..surfaces.len()).filter(|&w| w != v);
         let mut costs: Vec<(f64, usize)> = others.map(|w| (cost(v, w), w)).collect();

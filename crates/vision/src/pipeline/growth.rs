@@ -3,7 +3,8 @@
 //! of it again.
 //!
 //! A scene that was refined is not made again: it would fall back behind its steps. It keeps its
-//! Gaussians, and those of the new photos join where no photo before saw anything ([`version`]).
+//! Gaussians, and those of the new photos join where no photo before saw anything ([`version`]). So
+//! does a scene that would be worse at its old photos, each judged by the others.
 
 use rayon::prelude::*;
 use segsplat_render::{
@@ -19,6 +20,7 @@ use crate::{
     capture, center_of,
     error::{Error, Result},
     lift::{Fusion, UnionOptions},
+    refine::{halved_photo, judged_as_served},
     scene::{
         Camera, Gaussians, HealthReport, PosedPhoto, Scene, SceneCamera, SceneMeta, SceneOptions,
         Stage, Watch,
@@ -33,6 +35,13 @@ const BEHIND: f64 = 0.05;
 /// Longer side of the pictures for which Gaussians get the blur of magnification for good: that of
 /// a refinement.
 const LEARNT_SIDE: u32 = 640;
+
+/// Old photos that judge whether a scene that is made again is as good: those nearest to new ones.
+const JUDGES: usize = 6;
+/// Largest longer side of the pictures that they judge, pixels.
+const JUDGED_SIDE: u32 = 400;
+/// What they may lose in the mean, dB.
+const LOST_DB: f64 = 0.05;
 
 /// What the networks make of photos some of which are new.
 #[derive(Clone, Debug)]
@@ -137,8 +146,8 @@ fn see_more(
     Ok(Seen { views, capture, sets, method: known.method, stages: stages.times })
 }
 
-/// The version of the scene `served` after its photos changed: those of the numbers `kept` are the
-/// first ones of `grown`, all others of `served` are gone.
+/// The version of the scene `served` after its photos changed, which are `photos` now: those of the
+/// numbers `kept` are the first ones of `grown`, all others of `served` are gone.
 ///
 /// # Errors
 /// Those of the renderer; `internal` where they are not photos of this scene.
@@ -147,10 +156,11 @@ pub fn version(
     served: &Scene,
     kept: &[usize],
     grown: &Grown,
+    photos: &[PosedPhoto],
 ) -> Result<Reconstruction> {
     let made = &grown.made;
     let refined = served.meta.report.refinement.as_ref().is_some_and(|of| of.steps > 0);
-    if !refined {
+    if !refined && (grown.of_new.is_empty() || is_as_good(renderer, served, kept, made, photos)?) {
         return Ok(made.clone());
     }
     let gaussians = renumbered(&served.gaussians, kept)?;
@@ -177,17 +187,86 @@ pub fn version(
         }
     };
     cameras.extend(made.cameras.iter().skip(kept.len()).cloned());
+    // In layers, the new photos are never in front: theirs is what the others lack.
+    let mut network_focal_px = made.report.network_focal_px.clone();
+    if !refined {
+        let of_kept = kept.iter().filter_map(|&i| served.meta.report.network_focal_px.get(i));
+        network_focal_px.fill(0.0);
+        network_focal_px.iter_mut().zip(of_kept).for_each(|(new, old)| *new = *old);
+    }
     let report = HealthReport {
         photos: made.report.photos,
         views_used: made.report.views_used,
         gaussians: gaussians.len() as u64,
         overlap: made.report.overlap,
-        network_focal_px: made.report.network_focal_px.clone(),
+        network_focal_px,
         stages: made.report.stages.clone(),
         warnings: made.report.warnings.clone(),
         ..served.meta.report.clone()
     };
     Ok(Reconstruction { gaussians, backdrop: (*served.backdrop).clone(), report, cameras })
+}
+
+/// Whether a scene that was made again of `photos` is as good as `served` at the photos that stay,
+/// each left out of both.
+fn is_as_good(
+    renderer: &dyn Renderer,
+    served: &Scene,
+    kept: &[usize],
+    made: &Reconstruction,
+    photos: &[PosedPhoto],
+) -> Result<bool> {
+    let meta = SceneMeta {
+        cameras: made.cameras.clone(),
+        report: made.report.clone(),
+        ..served.meta.clone()
+    };
+    let made = Scene::new(meta, made.gaussians.clone(), made.backdrop.clone());
+    let mut gain = 0.0;
+    for photo in judges(photos, kept.len(), made.meta.report.median_depth) {
+        let truth = [small(&photos[photo])];
+        let of = |scene: &Scene, number: usize| {
+            judged_as_served(renderer, &without(scene, number), &truth)
+        };
+        if let (Some(old), Some(new)) = (of(served, kept[photo])?, of(&made, photo)?) {
+            gain += new.psnr - old.psnr + LOST_DB;
+        }
+    }
+    Ok(gain >= 0.0)
+}
+
+/// The photos of the first `before` that are nearest to one of the others, at most [`JUDGES`].
+fn judges(photos: &[PosedPhoto], before: usize, depth: f64) -> Vec<usize> {
+    let (old, new) = photos.split_at(before);
+    let pose = |photo: &PosedPhoto| photo.camera.camera_to_world;
+    let to_new = |photo: &PosedPhoto| {
+        let steps = new.iter().map(|other| pose(photo).apart(&pose(other), depth));
+        steps.fold(f64::INFINITY, f64::min)
+    };
+    let mut near: Vec<(f64, usize)> =
+        old.iter().enumerate().map(|(i, photo)| (to_new(photo), i)).collect();
+    near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    near.into_iter().take(JUDGES).map(|(_, photo)| photo).collect()
+}
+
+/// A photo halved until its longer side is at most [`JUDGED_SIDE`].
+fn small(photo: &PosedPhoto) -> PosedPhoto {
+    let mut small = photo.clone();
+    while small.photo.width.max(small.photo.height) > JUDGED_SIDE {
+        small = halved_photo(&small);
+    }
+    small
+}
+
+/// A scene as it is served without what one of its photos gave it.
+fn without(scene: &Scene, photo: usize) -> Scene {
+    let source = scene.gaussians.source();
+    let gaussians = scene.gaussians.only(|i| usize::from(source[i].view) != photo);
+    let mut meta = scene.meta.clone();
+    if let Some(focal) = meta.report.network_focal_px.get_mut(photo) {
+        *focal = 0.0;
+    }
+    Scene { meta, gaussians, semantics: None, ..scene.clone() }
 }
 
 /// The Gaussians of the photos `kept`, whose numbers are their places there.

@@ -29,7 +29,7 @@ use std::{
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 use segsplat_render::{
-    Background, DifferentiableRenderer, Frame, Kinds, RenderRequest,
+    Background, DifferentiableRenderer, Frame, Kinds, RenderRequest, Renderer,
     compare::psnr,
     plan::{default_near, served, widened},
     train::{
@@ -38,6 +38,7 @@ use segsplat_render::{
     },
 };
 
+pub(crate) use self::half::halved_photo;
 pub use self::spool::{MorePhotos, PhotoSpool};
 use self::{
     half::{halved, halved_camera},
@@ -639,7 +640,7 @@ pub fn judged_as_plain(
 /// # Errors
 /// What the renderer says.
 pub fn judged_as_served(
-    renderer: &dyn DifferentiableRenderer,
+    renderer: &dyn Renderer,
     scene: &Scene,
     held_out: &[PosedPhoto],
 ) -> Result<Option<Judged>> {
