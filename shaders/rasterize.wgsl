@@ -97,8 +97,8 @@ struct Pixel {
     transmittance: f32,
 }
 
-// exp(-6) is under ALPHA_MIN.
-const POWER_BOUND: f32 = 6.0;
+// exp(-1000) is 0. The opacity of a merged Gaussian may be over 1, so power_max has no bound.
+const POWER_BOUND: f32 = 1000.0;
 // No alpha is so large.
 const ENDED: f32 = 2.0;
 
@@ -120,7 +120,7 @@ fn blend(q: u32, some: bool, one: vec2<f32>, paint: vec4<f32>, label: u32, row: 
     let transmittance = pixels[q].transmittance;
     let left = transmittance * (1.0 - alpha);
     // Hardly a branch: invocations that part ways take as long as both ways together. Over
-    // POWER_BOUND alpha is under ALPHA_MIN for certain; a NaN is skipped too.
+    // POWER_BOUND alpha is 0; a NaN is skipped too.
     let hit = some && one.x <= POWER_BOUND && alpha >= pixels[q].least;
     let adds = hit && left > TRANSMITTANCE_MIN;
     pixels[q].least = select(pixels[q].least, ENDED, hit && left <= ray_end);
