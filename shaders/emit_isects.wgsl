@@ -2,7 +2,7 @@
 // CPU: crates/render/src/cpu/bin.rs (in the order of the scene)
 
 @group(0) @binding(1) var<storage, read_write> plans: array<Plan>;
-@group(0) @binding(2) var<storage, read> footprints: array<Footprint>;
+@group(0) @binding(2) var<storage, read> footprints: array<FootprintRows>;
 @group(0) @binding(3) var<storage, read> tiles: array<u32>;
 // Where the list of each tile starts; one more number ends the last one.
 @group(0) @binding(4) var<storage, read> starts: array<u32>;
@@ -40,28 +40,39 @@ fn main(
     let first = which * total;
     begin_visits(local);
     var footprint: Footprint;
+    var touched = 0u;
     var visits = false;
     // No pairs where there is no room for them.
     if i < total && plans[which].isects > 0u {
-        let touched = tiles[first + i];
-        if touched > 0u {
-            footprint = footprints[first + i];
-            visits = see(footprint, i, touched);
+        touched = tiles[first + i];
+        if touched >= SQUARE {
+            footprint.depth = footprints[first + i][1].w;
+        } else if touched > 0u {
+            footprint = footprint_of(footprints[first + i]);
         }
+        visits = touched > 0u && see(footprint, i, touched, local);
     }
-    open_bins();
+    open_bins(local);
     // First all count, then all place: one body, so that it finds the same tiles both times.
     for (var turn = 0u; turn < 2u; turn++) {
         placing = turn == 1u;
         if visits && (placing || bin_sides.x > 0u) {
-            visit_tiles(footprint, i, 0u, 1u, 0u, 1u);
+            visit_touched(touched, footprint, i);
         }
         workgroupBarrier();
         if !placing {
-            for (var bin = local; bin < bin_sides.x * bin_sides.y; bin += WORKGROUP_SIZE) {
-                let sum = atomicLoad(&bins[bin]);
+            for (var at = local; at < bin_sides.x * bin_sides.y; at += WORKGROUP_SIZE) {
+                var sum = 0u;
+                for (var k = 0u; k < bin_spread; k++) {
+                    sum += atomicLoad(&bins[at * bin_spread + k]);
+                }
                 if sum > 0u {
-                    atomicStore(&bins[bin], atomicAdd(&ends[number_of(tile_of(bin))], sum));
+                    var place = atomicAdd(&ends[number_of(tile_of(at))], sum);
+                    for (var k = 0u; k < bin_spread; k++) {
+                        let next = place + atomicLoad(&bins[at * bin_spread + k]);
+                        atomicStore(&bins[at * bin_spread + k], place);
+                        place = next;
+                    }
                 }
             }
         }
@@ -74,6 +85,6 @@ fn main(
     bin_sides = vec2(0u);
     for (var k = 0u; k < count; k++) {
         let id = large[k];
-        visit_tiles(footprints[first + id], id, local / 8u, 32u, local % 8u, 8u);
+        visit_tiles(footprint_of(footprints[first + id]), id, local / 8u, 32u, local % 8u, 8u);
     }
 }

@@ -1,9 +1,9 @@
 // Stage 1: Gaussians to footprints; some are dropped. The others are counted in their tiles.
 // CPU: crates/render/src/cpu/project.rs (in f64; here only depth is exact).
 
-@group(0) @binding(1) var<storage, read> gaussians: array<Gaussian>;
-@group(0) @binding(2) var<storage, read_write> footprints: array<Footprint>;
-// Tiles touched in the band.
+@group(0) @binding(1) var<storage, read> gaussians: array<array<vec4<f32>, 3>>;
+@group(0) @binding(2) var<storage, read_write> footprints: array<FootprintRows>;
+// What each touches in the band.
 @group(0) @binding(3) var<storage, read_write> tiles: array<u32>;
 @group(0) @binding(4) var<storage, read_write> plans: array<Plan>;
 // Gaussians that touch each tile of the band. 0 before.
@@ -36,9 +36,15 @@ fn blur_of(gaussian: Gaussian, source: Source, depth: f32) -> Blur {
     return Blur(0.0, learnt, learnt + PIXEL_PX2 * (1.0 - size * size));
 }
 
+fn gaussian_of(rows: array<vec4<f32>, 3>) -> Gaussian {
+    let first = rows[0];
+    let last = rows[2];
+    return Gaussian(first.xyz, first.w, rows[1], last.xyz, bitcast<u32>(last.w));
+}
+
 // EWA projection of Gaussian i; opacity 0 when it cannot be seen.
 fn project_one(i: u32) -> Footprint {
-    let gaussian = gaussians[i];
+    let gaussian = gaussian_of(gaussians[i]);
     let t = camera_point(gaussian.mean);
     var footprint = Footprint(vec2(0.0), 0.0, 0.0, 0.0, 0.0, 0.0, t.z);
     if !(t.z >= views[which].near && is_finite(t.z)) {
@@ -140,12 +146,12 @@ fn main(
     }
     begin_visits(local);
     var footprint: Footprint;
+    var touched = 0u;
     var visits = false;
     if i < views[which].gaussian_count {
         footprint = project_one(i);
-        var touched = 0u;
         if footprint.opacity > 0.0 {
-            touched = count_tiles(footprint, views[which].row_start, views[which].row_end);
+            touched = touched_by(footprint);
             var whole = touched;
             if views[which].row_end - views[which].row_start < views[which].tiles_y {
                 whole = count_tiles(footprint, 0u, views[which].tiles_y);
@@ -154,16 +160,16 @@ fn main(
                 atomicAdd(&seen, 1u);
             }
             if touched > 0u {
-                footprints[first + i] = footprint;
-                visits = see(footprint, i, touched);
+                footprints[first + i] = rows_of(footprint);
+                visits = see(footprint, i, touched, local);
             }
         }
         tiles[first + i] = touched;
     }
     storageBarrier();
-    open_bins();
+    open_bins(local);
     if visits {
-        visit_tiles(footprint, i, 0u, 1u, 0u, 1u);
+        visit_touched(touched, footprint, i);
     }
     if local == 0u {
         larges = atomicLoad(&large_count);
@@ -173,16 +179,19 @@ fn main(
         }
     }
     let count = workgroupUniformLoad(&larges);
-    for (var bin = local; bin < bin_sides.x * bin_sides.y; bin += WORKGROUP_SIZE) {
-        let sum = atomicLoad(&bins[bin]);
+    for (var at = local; at < bin_sides.x * bin_sides.y; at += WORKGROUP_SIZE) {
+        var sum = 0u;
+        for (var k = 0u; k < bin_spread; k++) {
+            sum += atomicLoad(&bins[at * bin_spread + k]);
+        }
         if sum > 0u {
-            atomicAdd(&ends[number_of(tile_of(bin))], sum);
+            atomicAdd(&ends[number_of(tile_of(at))], sum);
         }
     }
     // Those are not counted in bins: their sums are out already.
     bin_sides = vec2(0u);
     for (var k = 0u; k < count; k++) {
         let id = large[k];
-        visit_tiles(footprints[first + id], id, local / 8u, 32u, local % 8u, 8u);
+        visit_tiles(footprint_of(footprints[first + id]), id, local / 8u, 32u, local % 8u, 8u);
     }
 }

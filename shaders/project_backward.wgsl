@@ -6,8 +6,8 @@
 // which is sorted, in the order of the tiles.
 
 @group(0) @binding(1) var<storage, read> gaussians: array<Gaussian>;
-@group(0) @binding(2) var<storage, read> footprints: array<Footprint>;
-// Tiles touched.
+@group(0) @binding(2) var<storage, read> footprints: array<FootprintRows>;
+// What each touches.
 @group(0) @binding(3) var<storage, read> tiles: array<u32>;
 @group(0) @binding(4) var<storage, read> lists: array<vec2<u32>>;
 // (depth key, Gaussian)
@@ -180,9 +180,9 @@ fn main(
     var touched = 0u;
     var footprint: Footprint;
     if i < total {
-        touched = tiles[i];
+        touched = count_of(tiles[i]);
         if touched > 0u {
-            footprint = footprints[i];
+            footprint = footprint_of(footprints[i]);
         }
         if touched > LARGE_TILES {
             large[atomicAdd(&large_count, 1u)] = i;
@@ -199,7 +199,7 @@ fn main(
     for (var one = 0u; one < count; one++) {
         let id = large[one];
         found = array<f32, PAIR_SUMS>();
-        visit_tiles(footprints[id], id, local / 8u, 32u, local % 8u, 8u);
+        visit_tiles(footprint_of(footprints[id]), id, local / 8u, 32u, local % 8u, 8u);
         for (var k = 0u; k < PAIR_SUMS; k++) {
             shares[local * PAIR_SUMS + k] = found[k];
         }

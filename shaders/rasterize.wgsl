@@ -4,17 +4,20 @@
 // common/labels_*.wgsl define label_of, label_row, add_label and store_labels.
 //
 // Gaussians are staged in batches, each with one bit for every part that it meets. The invocations
-// of a part walk only its own bits.
+// of a part walk only its own bits. What a pixel reads of a Gaussian is as short as it can be: the
+// blend waits for that.
 
 // The pictures of the band one after another, each row-major: f32 as bits, or levels.
 @group(0) @binding(4) var<storage, read_write> pictures: array<u32>;
 
 // mean - tile corner, conic_shear, conic_x
 var<workgroup> shapes: array<vec4<f32>, 256>;
-// conic_y, opacity, power_max, label
+// conic_y, opacity, and the first two of its paint: colour, depth; of labels alone a row of their
+// table
 var<workgroup> weights: array<vec4<f32>, 256>;
-// colour, depth; of labels alone a row of their table
-var<workgroup> paints: array<vec4<f32>, 256>;
+// The rest of its paint.
+var<workgroup> paints: array<vec2<f32>, 256>;
+var<workgroup> labels: array<u32, 256>;
 // Parts met by each staged Gaussian, and the same bits the other way round: staged Gaussians that
 // meet a part, words[part + PARTS * (Gaussian / 32)].
 var<workgroup> met: array<u32, 256>;
@@ -31,6 +34,18 @@ override WITH_DEPTH: bool = true;
 override WITH_BYTES: bool = false;
 // Work that is left out because no pixel changes (crates/render/src/switches.rs).
 override SKIP_ENDED_RAYS: bool = true;
+
+// Part of the group-th eight pixels. Four in a row make a block of 8 x 4 pixels: where a surface
+// leans, what is next in depth meets all of them or none.
+fn part_of(group: u32) -> u32 {
+    let at = vec2(group & 1u, (group >> 1u) & 1u) + 2u * vec2((group >> 2u) & 1u, group >> 3u);
+    return at.y * 4u + at.x;
+}
+
+// Place of pixel q of this invocation in the tile.
+fn pixel_of(local: u32, q: u32) -> vec2<u32> {
+    return place_in_tile(part_of(local * PIXELS / PIXELS_MAX), local * PIXELS % PIXELS_MAX + q);
+}
 
 // A Gaussian on its way from the scene to the workgroup.
 struct Staged {
@@ -55,7 +70,7 @@ fn fetch(at: u32, end: u32) -> Staged {
     }
     let id = pairs[at].y;
     staged.some = true;
-    staged.footprint = footprints[which * views[which].gaussian_count + id];
+    staged.footprint = footprint_of(footprints[which * views[which].gaussian_count + id]);
     staged.label = label_of(id);
     if WITH_COLOR || WITH_DEPTH {
         staged.paint.w = abs(staged.footprint.depth);
@@ -74,12 +89,21 @@ struct Pixel {
     center: vec2<f32>,
     // Its number in the pictures of the band; NO_PICTURE outside of them.
     at: u32,
-    done: bool,
+    // The least alpha that counts; ENDED after its ray's end.
+    least: f32,
     color: vec3<f32>,
     depth: f32,
     alpha: f32,
     transmittance: f32,
 }
+
+// exp(-1000) is 0. The opacity of a merged Gaussian may be over 1, so power_max has no bound.
+const POWER_BOUND: f32 = 1000.0;
+// No alpha is so large.
+const ENDED: f32 = 2.0;
+
+// Transmittance at which a ray goes no farther: TRANSMITTANCE_MIN or more.
+var<private> ray_end: f32;
 
 // The pixels of this invocation.
 var<private> pixels: array<Pixel, PIXELS_MAX>;
@@ -91,17 +115,15 @@ fn alpha_of(q: u32, shape: vec4<f32>, weight: vec4<f32>) -> vec2<f32> {
     return vec2(power, min(ALPHA_MAX, weight.y * exp(-power)));
 }
 
-fn blend(q: u32, some: bool, one: vec2<f32>, weight: vec4<f32>, paint: vec4<f32>, row: vec4<f32>) {
+fn blend(q: u32, some: bool, one: vec2<f32>, paint: vec4<f32>, label: u32, row: vec4<f32>) {
     let alpha = one.y;
     let transmittance = pixels[q].transmittance;
     let left = transmittance * (1.0 - alpha);
-    // Hardly a branch: invocations that part ways take as long as both ways together. Over its
-    // power_max alpha is under ALPHA_MIN for certain; a NaN is skipped too.
-    let hit = some && one.x <= weight.z && alpha >= ALPHA_MIN && !pixels[q].done;
-    let ends = hit && left <= TRANSMITTANCE_MIN;
-    let adds = hit && !ends;
-    let ended = ends || (adds && left <= views[which].ray_end.x);
-    pixels[q].done = pixels[q].done || ended;
+    // Hardly a branch: invocations that part ways take as long as both ways together. Over
+    // POWER_BOUND alpha is 0; a NaN is skipped too.
+    let hit = some && one.x <= POWER_BOUND && alpha >= pixels[q].least;
+    let adds = hit && left > TRANSMITTANCE_MIN;
+    pixels[q].least = select(pixels[q].least, ENDED, hit && left <= ray_end);
     // Colours, depths and rows are finite: nothing of them adds 0.
     let share = select(0.0, alpha * transmittance, adds);
     if WITH_COLOR {
@@ -111,22 +133,45 @@ fn blend(q: u32, some: bool, one: vec2<f32>, weight: vec4<f32>, paint: vec4<f32>
         pixels[q].depth += share * paint.w;
     }
     if adds {
-        add_label(u32(weight.w), row, share, q, pixels[q].at);
+        add_label(label, row, share, q, pixels[q].at);
     }
     pixels[q].alpha += share;
     pixels[q].transmittance = select(transmittance, left, adds);
 }
 
-// Blends Gaussian k, and k_next behind it if `two`. The alphas of both are on their way at once.
-fn blend_two(q: u32, k: u32, k_next: u32, two: bool) {
+// A staged Gaussian and its alpha at a pixel.
+struct Met {
+    one: vec2<f32>,
+    paint: vec4<f32>,
+    label: u32,
+    row: vec4<f32>,
+}
+
+fn meet(q: u32, k: u32) -> Met {
     let weight = weights[k];
-    let weight_next = weights[k_next];
-    let one = alpha_of(q, shapes[k], weight);
-    let next = alpha_of(q, shapes[k_next], weight_next);
-    let paint = paints[k];
-    let paint_next = paints[k_next];
-    blend(q, true, one, weight, paint, row_of(u32(weight.w), paint));
-    blend(q, two, next, weight_next, paint_next, row_of(u32(weight_next.w), paint_next));
+    let paint = vec4(weight.zw, paints[k]);
+    let label = labels[k];
+    return Met(alpha_of(q, shapes[k], weight), paint, label, row_of(label, paint));
+}
+
+// Blends Gaussian k.x, and k.y behind it if `more`. Their alphas are on their way at once.
+fn blend_two(q: u32, k: vec2<u32>, more: bool) {
+    let a = meet(q, k.x);
+    let b = meet(q, k.y);
+    blend(q, true, a.one, a.paint, a.label, a.row);
+    blend(q, more, b.one, b.paint, b.label, b.row);
+}
+
+// The same with four, as far as `more`: for one pixel an invocation.
+fn blend_four(k: vec4<u32>, more: vec3<bool>) {
+    let a = meet(0u, k.x);
+    let b = meet(0u, k.y);
+    let c = meet(0u, k.z);
+    let d = meet(0u, k.w);
+    blend(0u, true, a.one, a.paint, a.label, a.row);
+    blend(0u, more.x, b.one, b.paint, b.label, b.row);
+    blend(0u, more.y, c.one, c.paint, c.label, c.row);
+    blend(0u, more.z, d.one, d.paint, d.label, d.row);
 }
 
 // Colours of the pixels of this invocation in 24 bits.
@@ -190,7 +235,7 @@ fn pack_bytes(of_four: vec4<u32>) -> u32 {
 // Writes the pictures whose pixels share words, by way of `met` and `words`.
 fn store_bytes(local: u32, tile: vec2<u32>) {
     for (var q = 0u; q < PIXELS; q++) {
-        let place = place_of(local, q);
+        let place = pixel_of(local, q);
         let to = place.y * TILE_SIZE + place.x;
         let inside = pixels[q].at != NO_PICTURE;
         let bytes = level(min(pixels[q].alpha, 1.0)) | (mask_byte(q) << 8u);
@@ -241,11 +286,12 @@ fn main(
     @builtin(local_invocation_index) local: u32,
 ) {
     which = tile.z;
+    ray_end = views[which].ray_end.x;
     // Views of a batch may differ in size.
     let tiled = tile.x < views[which].tiles_x
         && tile.y + views[which].row_start < views[which].row_end;
     let corner = vec2<f32>(vec2(tile.x, tile.y + views[which].row_start) * TILE_SIZE);
-    let part = local * PIXELS / 8u;
+    let part = part_of(local * PIXELS / PIXELS_MAX);
     var start = 0u;
     var end = 0u;
     if tiled {
@@ -260,13 +306,15 @@ fn main(
     workgroupBarrier();
     var open = 0u;
     for (var q = 0u; q < PIXELS; q++) {
-        let at = place_of(local, q);
+        let at = pixel_of(local, q);
         let x = tile.x * TILE_SIZE + at.x;
         let y = tile.y * TILE_SIZE + at.y;
         let inside = tiled && x < views[which].width
             && y + views[which].row_start * TILE_SIZE < views[which].height;
         let place = select(NO_PICTURE, y * views[which].width + x, inside);
-        pixels[q] = Pixel(vec2<f32>(at) + 0.5, place, !inside, vec3(0.0), 0.0, 0.0, 1.0);
+        pixels[q] = Pixel(
+            vec2<f32>(at) + 0.5, place, select(ENDED, ALPHA_MIN, inside), vec3(0.0), 0.0, 0.0, 1.0,
+        );
         open += u32(inside);
     }
     var counted = open == 0u;
@@ -287,9 +335,9 @@ fn main(
                 let mean = one.mean - corner;
                 parts = parts_of(one, mean);
                 shapes[to] = vec4(mean, one.conic_shear, one.conic_x);
-                // A label has 16 bits: exact as f32.
-                weights[to] = vec4(one.conic_y, one.opacity, one.power_max, f32(staged[q].label));
-                paints[to] = staged[q].paint;
+                weights[to] = vec4(one.conic_y, one.opacity, staged[q].paint.xy);
+                paints[to] = staged[q].paint.zw;
+                labels[to] = staged[q].label;
             }
             met[to] = parts;
         }
@@ -323,22 +371,31 @@ fn main(
             if word == 0u {
                 break;
             }
-            let k = w * 32u + firstTrailingBit(word);
+            var four: vec4<u32>;
+            var more: vec3<bool>;
+            four.x = firstTrailingBit(word);
             word &= word - 1u;
-            let two = word != 0u;
-            let k_next = select(k, w * 32u + firstTrailingBit(word), two);
+            more.x = word != 0u;
+            four.y = select(four.x, firstTrailingBit(word), more.x);
             word &= max(word, 1u) - 1u;
-            // No loop where there is one: GPUs' compilers make less of a loop within a loop.
-            blend_two(0u, k, k_next, two);
-            if PIXELS > 1u {
-                for (var q = 1u; q < PIXELS; q++) {
-                    blend_two(q, k, k_next, two);
+            // No loop where there is one pixel: GPUs' compilers make less of a loop within a loop.
+            if PIXELS == 1u {
+                more.y = word != 0u;
+                four.z = select(four.x, firstTrailingBit(word), more.y);
+                word &= max(word, 1u) - 1u;
+                more.z = word != 0u;
+                four.w = select(four.x, firstTrailingBit(word), more.z);
+                word &= max(word, 1u) - 1u;
+                blend_four(four + w * 32u, more);
+            } else {
+                for (var q = 0u; q < PIXELS; q++) {
+                    blend_two(q, four.xy + w * 32u, more.x);
                 }
             }
         }
         open = 0u;
         for (var q = 0u; q < PIXELS; q++) {
-            open += u32(!pixels[q].done);
+            open += u32(pixels[q].least < ENDED);
         }
         if open == 0u && !counted {
             counted = true;

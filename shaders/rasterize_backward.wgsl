@@ -124,7 +124,7 @@ fn fetch(local: u32, at: u32, end: u32) -> Staged {
     }
     let id = pairs[at].y;
     staged.some = true;
-    staged.footprint = footprints[which * views[which].gaussian_count + id];
+    staged.footprint = footprint_of(footprints[which * views[which].gaussian_count + id]);
     staged.paint.w = abs(staged.footprint.depth);
     if BY_COLOR {
         staged.paint = vec4(color_of(id), staged.paint.w);

@@ -1,10 +1,12 @@
 // Stage 5: the list of each tile in the order of depth, then of the scene.
 // CPU: crates/render/src/cpu/rasterize.rs (in portions)
 //
-// Up to SORT_RUN pairs are sorted in workgroup memory, by a bitonic network. An invocation takes
-// eight numbers at a time through up to three stages of it. Longer lists are merged in the device's
-// memory. On a software adapter, where a barrier costs more than a merge, few invocations merge a
-// list from single pairs on.
+// Up to SORT_RUN pairs are sorted in workgroup memory, by a bitonic network of one word each: the
+// depth between the least and the largest one of them in 21 bits, and which pair it is. An
+// invocation takes eight words at a time through up to three stages of the network. The few pairs
+// whose bits are equal are put in order when they are written. Longer lists are merged in the
+// device's memory; where many bits are equal, from single pairs on. A software adapter, where a
+// barrier costs more than a merge, does only that, with few invocations.
 
 @group(0) @binding(1) var<storage, read> starts: array<u32>;
 @group(0) @binding(2) var<storage, read> ends: array<u32>;
@@ -17,41 +19,78 @@
 // alone could not merge a long list.
 const SERIAL_SIZE: u32 = 64u;
 
-var<workgroup> run: array<vec2<u32>, SORT_RUN>;
-var<private> eight: array<vec2<u32>, 8>;
+// Bits of a word that say which pair it is.
+const PLACE_BITS: u32 = 11u;
+// More pairs of equal bits than this are merged.
+const EQUAL_MAX: u32 = 32u;
+
+var<workgroup> run: array<u32, SORT_RUN>;
+// Whether too many pairs of a run have equal bits.
+var<workgroup> crowded: atomic<u32>;
+var<private> eight: array<u32, 8>;
 
 fn is_after(a: vec2<u32>, b: vec2<u32>) -> bool {
     return a.x > b.x || (a.x == b.x && a.y > b.y);
 }
 
 // Orders two of the eight.
-fn order(a: u32, b: u32, up: bool) {
+fn order(a: u32, b: u32) {
     let one = eight[a];
     let other = eight[b];
-    let swap = is_after(one, other) == up;
-    eight[a] = select(one, other, swap);
-    eight[b] = select(other, one, swap);
+    eight[a] = min(one, other);
+    eight[b] = max(one, other);
 }
 
-// Place of number i in `run`: neighbours of eight lie in different banks.
+// Place of number i in `run`: those that an invocation and its neighbours take lie in different
+// banks.
 fn bank(i: u32) -> u32 {
-    return i ^ ((i >> 4u) & 15u);
+    return i ^ ((i >> 5u) & 7u) ^ ((i >> 3u) & 24u);
 }
 
-// Sorts `count` pairs from `first` on, at most SORT_RUN.
-fn sort_run(first: u32, count: u32, local: u32) {
-    // Of 2^bits numbers, at least 8; those after the last pair are the largest.
-    let bits = max(32u - countLeadingZeros(max(count, 1u) - 1u), 3u);
-    let works = local < (1u << (bits - 3u));
-    for (var i = local; i < (1u << bits); i += WORKGROUP_SIZE) {
-        var one = vec2(0xffffffffu);
+// The least and the largest depth key of `count` pairs from `first` on.
+fn reach_of(first: u32, count: u32, local: u32) -> vec2<u32> {
+    var reach = vec2(0xffffffffu, 0u);
+    for (var i = local; i < count; i += WORKGROUP_SIZE) {
+        let key = pairs[first + i].x;
+        reach = vec2(min(reach.x, key), max(reach.y, key));
+    }
+    run[local] = reach.x;
+    run[WORKGROUP_SIZE + local] = reach.y;
+    workgroupBarrier();
+    if local < 16u {
+        for (var k = 16u; k < WORKGROUP_SIZE; k += 16u) {
+            reach.x = min(reach.x, run[local + k]);
+            reach.y = max(reach.y, run[WORKGROUP_SIZE + local + k]);
+        }
+        run[2u * WORKGROUP_SIZE + local] = reach.x;
+        run[2u * WORKGROUP_SIZE + 16u + local] = reach.y;
+    }
+    workgroupBarrier();
+    for (var k = 0u; k < 16u; k++) {
+        reach.x = min(reach.x, run[2u * WORKGROUP_SIZE + k]);
+        reach.y = max(reach.y, run[2u * WORKGROUP_SIZE + 16u + k]);
+    }
+    workgroupBarrier();
+    return reach;
+}
+
+// Sorts `count` pairs from `first` on, at most SORT_RUN, into those from `to` on.
+fn sort_run(first: u32, to: u32, count: u32, local: u32) {
+    let reach = reach_of(first, count, local);
+    let shift = max(32u - countLeadingZeros(reach.y - reach.x), 32u - PLACE_BITS)
+        - (32u - PLACE_BITS);
+    // Of 2^size_bits numbers, at least 8; those after the last pair are the largest.
+    let size_bits = max(32u - countLeadingZeros(max(count, 1u) - 1u), 3u);
+    let works = local < (1u << (size_bits - 3u));
+    for (var i = local; i < (1u << size_bits); i += WORKGROUP_SIZE) {
+        var one = 0xffffffffu;
         if i < count {
-            one = pairs[first + i];
+            one = (((pairs[first + i].x - reach.x) >> shift) << PLACE_BITS) | i;
         }
         run[bank(i)] = one;
     }
     workgroupBarrier();
-    for (var size = 1u; size <= bits; size++) {
+    for (var size = 1u; size <= size_bits; size++) {
         // Stages of distances 2^(high) down to 1, up to three at a time.
         var above = size;
         if size < 3u {
@@ -65,39 +104,54 @@ fn sort_run(first: u32, count: u32, local: u32) {
                     eight[k] = run[bank(base + (k << low))];
                 }
                 if size == 3u {
-                    // The first three sizes at once.
-                    order(0u, 1u, true);
-                    order(2u, 3u, false);
-                    order(4u, 5u, true);
-                    order(6u, 7u, false);
-                    order(0u, 2u, true);
-                    order(1u, 3u, true);
-                    order(4u, 6u, false);
-                    order(5u, 7u, false);
-                    order(0u, 1u, true);
-                    order(2u, 3u, true);
-                    order(4u, 5u, false);
-                    order(6u, 7u, false);
+                    // The first two sizes: those that are to descend are turned around.
+                    eight[2] = ~eight[2];
+                    eight[3] = ~eight[3];
+                    eight[6] = ~eight[6];
+                    eight[7] = ~eight[7];
+                    order(0u, 1u);
+                    order(2u, 3u);
+                    order(4u, 5u);
+                    order(6u, 7u);
+                    eight[2] = ~eight[2];
+                    eight[3] = ~eight[3];
+                    eight[4] = ~eight[4];
+                    eight[5] = ~eight[5];
+                    order(0u, 2u);
+                    order(1u, 3u);
+                    order(4u, 6u);
+                    order(5u, 7u);
+                    order(0u, 1u);
+                    order(2u, 3u);
+                    order(4u, 5u);
+                    order(6u, 7u);
+                    eight[4] = ~eight[4];
+                    eight[5] = ~eight[5];
+                    eight[6] = ~eight[6];
+                    eight[7] = ~eight[7];
                 }
-                let up = (base & (1u << size)) == 0u;
+                let turned = select(0xffffffffu, 0u, (base & (1u << size)) == 0u);
+                for (var k = 0u; k < 8u; k++) {
+                    eight[k] ^= turned;
+                }
                 if above > low + 2u {
-                    order(0u, 4u, up);
-                    order(1u, 5u, up);
-                    order(2u, 6u, up);
-                    order(3u, 7u, up);
+                    order(0u, 4u);
+                    order(1u, 5u);
+                    order(2u, 6u);
+                    order(3u, 7u);
                 }
                 if above > low + 1u {
-                    order(0u, 2u, up);
-                    order(1u, 3u, up);
-                    order(4u, 6u, up);
-                    order(5u, 7u, up);
+                    order(0u, 2u);
+                    order(1u, 3u);
+                    order(4u, 6u);
+                    order(5u, 7u);
                 }
-                order(0u, 1u, up);
-                order(2u, 3u, up);
-                order(4u, 5u, up);
-                order(6u, 7u, up);
+                order(0u, 1u);
+                order(2u, 3u);
+                order(4u, 5u);
+                order(6u, 7u);
                 for (var k = 0u; k < 8u; k++) {
-                    run[bank(base + (k << low))] = eight[k];
+                    run[bank(base + (k << low))] = eight[k] ^ turned;
                 }
             }
             workgroupBarrier();
@@ -105,7 +159,28 @@ fn sort_run(first: u32, count: u32, local: u32) {
         }
     }
     for (var i = local; i < count; i += WORKGROUP_SIZE) {
-        pairs[first + i] = run[bank(i)];
+        let word = run[bank(i)];
+        let pair = pairs[first + (word & (SORT_RUN - 1u))];
+        // Those of equal bits around it.
+        var begin = i;
+        var place = i;
+        while begin > 0u && i - begin < EQUAL_MAX
+            && ((run[bank(begin - 1u)] ^ word) >> PLACE_BITS) == 0u {
+            begin--;
+            let other = pairs[first + (run[bank(begin)] & (SORT_RUN - 1u))];
+            place -= u32(!is_after(pair, other));
+        }
+        var last = i + 1u;
+        while last < count && last - begin <= EQUAL_MAX
+            && ((run[bank(last)] ^ word) >> PLACE_BITS) == 0u {
+            let other = pairs[first + (run[bank(last)] & (SORT_RUN - 1u))];
+            place += u32(is_after(pair, other));
+            last++;
+        }
+        if last - begin > EQUAL_MAX {
+            atomicStore(&crowded, 1u);
+        }
+        pairs[to + place] = pair;
     }
 }
 
@@ -150,18 +225,21 @@ fn merge(from_first: u32, to_first: u32, count: u32, width: u32, local: u32, sha
     }
 }
 
-// Merges the runs of `width` pairs of a tile's list until one is left.
-fn merge_all(tile: u32, list: vec2<u32>, width: u32, half: u32, local: u32, sharers: u32) {
+// Merges the runs of `width` pairs of a tile's list, which are in the half `since` (0 or 1), until
+// one is left.
+fn merge_all(
+    tile: u32, list: vec2<u32>, width: u32, half: u32, since: u32, local: u32, sharers: u32,
+) {
     let count = list.y - list.x;
     let rounds = select(32u - countLeadingZeros((count - 1u) / width), 0u, count <= width);
     for (var round = 0u; round < rounds; round++) {
         storageBarrier();
-        let from_first = list.x + (round & 1u) * half;
-        let to_first = list.x + (1u - (round & 1u)) * half;
+        let from_first = list.x + ((round + since) & 1u) * half;
+        let to_first = list.x + (1u - ((round + since) & 1u)) * half;
         merge(from_first, to_first, count, width << round, local, sharers);
     }
     if local == 0u {
-        lists[tile] = list + (rounds & 1u) * half;
+        lists[tile] = list + ((rounds + since) & 1u) * half;
     }
 }
 
@@ -188,12 +266,18 @@ fn main(
     }
     let tile = views[which].range_start + group.y * views[which].tiles_x + group.x;
     let list = list_of(tile);
-    for (var start = list.x; start < list.y; start += SORT_RUN) {
-        sort_run(start, min(list.y - start, SORT_RUN), local);
-        workgroupBarrier();
-    }
     let half = groups.z * views[which].isect_capacity;
-    merge_all(tile, list, SORT_RUN, half, local, WORKGROUP_SIZE);
+    if local == 0u {
+        atomicStore(&crowded, 0u);
+    }
+    for (var start = list.x; start < list.y; start += SORT_RUN) {
+        workgroupBarrier();
+        sort_run(start, start + half, min(list.y - start, SORT_RUN), local);
+    }
+    workgroupBarrier();
+    let again = atomicLoad(&crowded) > 0u;
+    let width = select(SORT_RUN, 1u, again);
+    merge_all(tile, list, width, half, select(1u, 0u, again), local, WORKGROUP_SIZE);
 }
 
 @compute @workgroup_size(SERIAL_SIZE)
@@ -208,5 +292,5 @@ fn serial(
     }
     let tile = views[which].range_start + group.y * views[which].tiles_x + group.x;
     let half = groups.z * views[which].isect_capacity;
-    merge_all(tile, list_of(tile), 1u, half, local, SERIAL_SIZE);
+    merge_all(tile, list_of(tile), 1u, half, 0u, local, SERIAL_SIZE);
 }

@@ -7,7 +7,7 @@
 // An invocation works for PIXELS pixels of a part: one on a GPU, all eight on a software adapter,
 // where reading a staged Gaussian costs more than blending it.
 
-@group(0) @binding(1) var<storage, read> footprints: array<Footprint>;
+@group(0) @binding(1) var<storage, read> footprints: array<FootprintRows>;
 // (depth key, Gaussian)
 @group(0) @binding(2) var<storage, read> pairs: array<vec2<u32>>;
 // First pair of each tile, sorted, and one past its last.

@@ -88,6 +88,71 @@ fn count_tiles(footprint: Footprint, row_start: u32, row_end: u32) -> u32 {
     return count;
 }
 
+// What a Gaussian touches in the band, in a word: 0 for nothing. Most touch tiles of a square of
+// 2 x 2 alone. Their word is SQUARE with the row of its first tile, its column, and a bit for each
+// of its tiles. Other words are numbers of tiles.
+const SQUARE: u32 = 0x80000000u;
+const SQUARE_COLUMNS: u32 = 8192u;
+const SQUARE_ROWS: u32 = 16384u;
+
+// Bits of two tiles from `left` on that a span holds.
+fn in_square(span: vec2<u32>, left: u32) -> u32 {
+    return select(0u, (1u << (span.y - left)) - (1u << (span.x - left)), span.x < span.y);
+}
+
+fn touched_by(footprint: Footprint) -> u32 {
+    let extent = extent_of(footprint, views[which].row_start, views[which].row_end);
+    if extent.top > extent.bottom {
+        return 0u;
+    }
+    let size = i32(TILE_SIZE);
+    let first = extent.top / size;
+    let last = extent.bottom / size;
+    if last - first < 2 {
+        let upper = tile_span(footprint, extent, first);
+        var lower = vec2(0u);
+        if last > first {
+            lower = tile_span(footprint, extent, last);
+        }
+        let left = min(
+            select(0xffffffffu, upper.x, upper.x < upper.y),
+            select(0xffffffffu, lower.x, lower.x < lower.y),
+        );
+        let right = max(upper.y, lower.y);
+        if right == 0u {
+            return 0u;
+        }
+        if right - left <= 2u && left < SQUARE_COLUMNS && u32(first) < SQUARE_ROWS {
+            let four = in_square(upper, left) | (in_square(lower, left) << 2u);
+            return SQUARE | (u32(first) << 17u) | (left << 4u) | four;
+        }
+    }
+    return count_tiles(footprint, views[which].row_start, views[which].row_end);
+}
+
+// Number of tiles of such a word.
+fn count_of(touched: u32) -> u32 {
+    return select(touched, countOneBits(touched & 15u), touched >= SQUARE);
+}
+
+fn square_corner(touched: u32) -> vec2<u32> {
+    return vec2(touched >> 4u, touched >> 17u) & vec2(SQUARE_COLUMNS - 1u, SQUARE_ROWS - 1u);
+}
+
+// Visits the tiles of a word; the footprint is read where it is none of a square.
+fn visit_touched(touched: u32, footprint: Footprint, id: u32) {
+    if touched >= SQUARE {
+        let corner = square_corner(touched);
+        for (var k = 0u; k < 4u; k++) {
+            if ((touched >> k) & 1u) != 0u {
+                visit(corner + vec2(k & 1u, k >> 1u), footprint, id);
+            }
+        }
+    } else if touched > 0u {
+        visit_tiles(footprint, id, 0u, 1u, 0u, 1u);
+    }
+}
+
 // Visits the tiles that a footprint touches in the band: of its rows of tiles every `lines`-th from
 // `line`, of each row every `steps`-th tile from `step`. A shader says what a visit does.
 fn visit_tiles(footprint: Footprint, id: u32, line: u32, lines: u32, step: u32, steps: u32) {
@@ -113,22 +178,28 @@ fn number_of(tile: vec2<u32>) -> u32 {
 
 // A device adds slowly to one address, and Gaussians that are neighbours in memory touch the same
 // tiles. So a workgroup first counts by itself in the box of the tiles that its Gaussians touch,
-// where that box is small.
+// where that box is small. Where it is smaller still, a tile has SPREAD bins, and neighbours among
+// the invocations use different ones.
+const SPREAD: u32 = 8u;
 var<workgroup> bins: array<atomic<u32>, BINS>;
-// Least column and row, largest column and row.
-var<workgroup> bin_box: array<atomic<u32>, 4>;
+// Least columns and rows, largest columns and rows; each of every 32nd invocation, then of all.
+var<workgroup> bin_boxes: array<atomic<u32>, 128>;
+var<workgroup> bin_box: array<u32, 4>;
 // Gaussians that touch many tiles: all invocations of the workgroup visit those together.
 var<workgroup> large: array<u32, WORKGROUP_SIZE>;
 var<workgroup> large_count: atomic<u32>;
 var<workgroup> larges: u32;
 
-// First tile and sides of the box, once all have seen their Gaussian.
+// First tile and sides of the box, and bins of a tile, once all have seen their Gaussian.
 var<private> bin_corner: vec2<u32>;
 var<private> bin_sides: vec2<u32>;
+var<private> bin_spread: u32;
+// This invocation's bin of those of a tile.
+var<private> own_bin: u32;
 
 fn begin_visits(local: u32) {
-    if local < 4u {
-        atomicStore(&bin_box[local], select(0u, 0xffffffffu, local < 2u));
+    if local < 128u {
+        atomicStore(&bin_boxes[local], select(0u, 0xffffffffu, local < 64u));
     }
     if local == 0u {
         atomicStore(&large_count, 0u);
@@ -140,43 +211,64 @@ fn begin_visits(local: u32) {
 }
 
 // Whether this invocation visits the tiles of its Gaussian itself.
-fn see(footprint: Footprint, id: u32, touched: u32) -> bool {
-    if touched > LARGE_TILES {
+fn see(footprint: Footprint, id: u32, touched: u32, local: u32) -> bool {
+    if count_of(touched) > LARGE_TILES {
         large[atomicAdd(&large_count, 1u)] = id;
         return false;
     }
-    let extent = extent_of(footprint, views[which].row_start, views[which].row_end);
-    let size = i32(TILE_SIZE);
-    let last = i32(views[which].tiles_x) - 1;
-    let left = to_pixel(floor(footprint.mean.x - extent.wide)) / size;
-    let right = to_pixel(ceil(footprint.mean.x + extent.wide)) / size;
-    atomicMin(&bin_box[0], u32(clamp(left, 0, last)));
-    atomicMin(&bin_box[1], u32(extent.top / size));
-    atomicMax(&bin_box[2], u32(clamp(right, 0, last)));
-    atomicMax(&bin_box[3], u32(extent.bottom / size));
+    var low = square_corner(touched);
+    var high = low + vec2(
+        select(0u, 1u, (touched & 10u) != 0u), select(0u, 1u, (touched & 12u) != 0u),
+    );
+    if touched < SQUARE {
+        let extent = extent_of(footprint, views[which].row_start, views[which].row_end);
+        let size = i32(TILE_SIZE);
+        let last = i32(views[which].tiles_x) - 1;
+        let left = to_pixel(floor(footprint.mean.x - extent.wide)) / size;
+        let right = to_pixel(ceil(footprint.mean.x + extent.wide)) / size;
+        low = vec2<u32>(vec2(clamp(left, 0, last), extent.top / size));
+        high = vec2<u32>(vec2(clamp(right, 0, last), extent.bottom / size));
+    }
+    let lane = local % 32u;
+    atomicMin(&bin_boxes[lane], low.x);
+    atomicMin(&bin_boxes[32u + lane], low.y);
+    atomicMax(&bin_boxes[64u + lane], high.x);
+    atomicMax(&bin_boxes[96u + lane], high.y);
     return true;
 }
 
 // After all have seen their Gaussian.
-fn open_bins() {
+fn open_bins(local: u32) {
     workgroupBarrier();
-    bin_corner = vec2(atomicLoad(&bin_box[0]), atomicLoad(&bin_box[1]));
-    let last = vec2(atomicLoad(&bin_box[2]), atomicLoad(&bin_box[3]));
+    if local < 4u {
+        var edge = atomicLoad(&bin_boxes[local * 32u]);
+        for (var k = 1u; k < 32u; k++) {
+            let other = atomicLoad(&bin_boxes[local * 32u + k]);
+            edge = select(max(edge, other), min(edge, other), local < 2u);
+        }
+        bin_box[local] = edge;
+    }
+    workgroupBarrier();
+    bin_corner = vec2(bin_box[0], bin_box[1]);
+    let last = vec2(bin_box[2], bin_box[3]);
     bin_sides = vec2(0u);
     if all(last >= bin_corner) {
         let sides = last - bin_corner + vec2(1u);
         bin_sides = select(vec2(0u), sides, max(sides.x, sides.y) <= BINS
             && sides.x * sides.y <= BINS);
     }
+    bin_spread = select(1u, SPREAD, bin_sides.x * bin_sides.y <= BINS / SPREAD);
+    own_bin = local % bin_spread;
 }
 
 // Bin of a tile; BINS for those that have none.
 fn bin_of(tile: vec2<u32>) -> u32 {
     let at = tile - bin_corner;
-    return select(BINS, at.y * bin_sides.x + at.x, all(at < bin_sides));
+    let bin = (at.y * bin_sides.x + at.x) * bin_spread + own_bin;
+    return select(BINS, bin, all(at < bin_sides));
 }
 
-// Tile of a bin.
-fn tile_of(bin: u32) -> vec2<u32> {
-    return bin_corner + vec2(bin % bin_sides.x, bin / bin_sides.x);
+// Tile of that number of the box.
+fn tile_of(at: u32) -> vec2<u32> {
+    return bin_corner + vec2(at % bin_sides.x, at / bin_sides.x);
 }

@@ -38,7 +38,7 @@ pub(super) struct BatchBuffers {
     /// Gaussians that cull leaves, of all views, and the workgroups of the stages that read them.
     pub(super) rows: wgpu::Buffer,
     pub(super) dispatch: wgpu::Buffer,
-    /// Tiles that each Gaussian touches.
+    /// Which tiles each Gaussian touches.
     pub(super) touched: wgpu::Buffer,
     /// Photos of all views.
     pub(super) sources: wgpu::Buffer,

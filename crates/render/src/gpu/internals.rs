@@ -40,6 +40,8 @@ pub struct ProjectedRows {
     pub footprints: Vec<FootprintRow>,
     /// `[N]` tiles touched, 0 for a dropped Gaussian.
     pub touched: Vec<u32>,
+    /// `[N]` words that say which these are: `shaders/common/tiles.wgsl`.
+    pub words: Vec<u32>,
     /// Gaussians that touch each tile.
     pub tiles: Vec<u32>,
     /// Gaussians that touch the picture.
@@ -106,11 +108,15 @@ impl Internals<'_> {
                 (&room.ends, 0, (row.tiles_x * row.tiles_y) as usize * 4),
                 (&room.plans, 0, size_of::<PlanRow>()),
             ];
-            let [footprints, touched, tiles, plans] =
+            let [footprints, words, tiles, plans] =
                 stage.read(parts, |stages| stages.gaussians(Kernel::Project))?;
+            let words: Vec<u32> = cast(&words);
+            let in_square = |word: u32| (word & 15).count_ones();
+            let count = |&word: &u32| if word >= 1 << 31 { in_square(word) } else { word };
             Ok(ProjectedRows {
                 footprints: cast(&footprints),
-                touched: cast(&touched),
+                touched: words.iter().map(count).collect(),
+                words,
                 tiles: cast(&tiles),
                 visible: cast::<PlanRow>(&plans)[0].visible,
             })
@@ -173,7 +179,7 @@ impl Internals<'_> {
         self.run(row, 0, None, |stage| {
             let (room, tiles) = (&stage.room, [view.tiles_x(), view.tiles_y()]);
             stage.write(&room.footprints, &rows.footprints);
-            stage.write(&room.touched, &rows.touched);
+            stage.write(&room.touched, &rows.words);
             stage.write(&room.ends, &rows.tiles);
             let parts =
                 [(&room.lists, 0, rows.tiles.len() * 8), (&room.pairs, 0, total as usize * 16)];

@@ -127,6 +127,12 @@ fn tile_sort_twin() {
             }
         }
         lists.extend([10_000, 70_001].map(|count| list(count, 900, &mut random)));
+        // One pair far behind the others: in 21 bits of that reach a few, many or all are equal.
+        for (count, range) in [(1_000, 300_000), (2_048, 900_000), (5_000, 900_000), (500, 90)] {
+            let mut near = list(count, range, &mut random);
+            near.push([0xc000_0000, u32::MAX]);
+            lists.push(near);
+        }
         lists.push(Vec::new());
         let got = gpu.internals().tile_sort(&lists).expect("lists");
         for (got, mut want) in got.into_iter().zip(lists) {
