@@ -266,7 +266,10 @@ impl TileBackward<'_> {
             staged.extend(batch.iter().map(|&pair| {
                 let id = ids[bin::value(pair) as usize] as usize;
                 let footprint = footprints[id];
-                stage(&footprint, tile, paint.channels(&footprint, id), 0)
+                let mut staged = Staged::default();
+                stage(&footprint, tile, &mut staged);
+                paint.put_channels(&footprint, id, &mut staged.channels);
+                staged
             }));
             for (gaussian, &pair) in staged.iter().zip(batch) {
                 let met = u32::from(met(simd, gaussian)) & open;

@@ -152,7 +152,7 @@ impl Bins {
         for &tile in &*emitted {
             let (place, id) = (&mut ends[key(tile) as usize], value(tile) as usize);
             pairs[*place as usize] =
-                keys.pair(projected.footprints[id].depth, id, &projected.shown);
+                keys.pair(projected.tile_spans[id].depth, id, &projected.shown);
             *place += 1;
         }
     }

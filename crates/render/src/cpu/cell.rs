@@ -35,7 +35,7 @@ pub(super) const CELL_Y: Numbers = along(ACROSS, true, CELL as f32);
 pub(super) const PIXEL_X: Numbers = along(CELL, false, 1.0);
 pub(super) const PIXEL_Y: Numbers = along(CELL, true, 1.0);
 /// One number for each of 16 pixels or cells, in one line of the cache.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[repr(C, align(64))]
 pub(super) struct Numbers(pub(super) [f32; 16]);
 

@@ -22,6 +22,8 @@ use crate::{
 
 /// Words of the set of Gaussians that a thread reads at a time.
 const WORDS: usize = 1 << 10;
+/// Where fewer blocks than one in this many are left out, none is.
+const NEARLY: usize = 8;
 
 /// The Gaussians of a view, in the order of the scene.
 #[derive(Debug, Default)]
@@ -42,7 +44,9 @@ impl Shown {
     /// Those of the blocks that `frustum` shows.
     pub fn of(blocks: &Blocks, frustum: &Frustum) -> Self {
         let seen = blocks.shown(frustum);
-        if seen.len() == blocks.own && seen.last().is_none_or(|&at| (at as usize) < blocks.own) {
+        // Nearly all: to project the others costs less than a list.
+        let nearly = seen.len() >= blocks.own - blocks.own / NEARLY;
+        if nearly && seen.last().is_none_or(|&at| (at as usize) < blocks.own) {
             return Self::All;
         }
         Self::Some { ids: Self::ids_of(blocks, &seen), merged: blocks.merged.clone() }
@@ -66,19 +70,32 @@ impl Shown {
                 bits[run[0] as usize / 64].fetch_or(word, Ordering::Relaxed);
             }
         });
-        let ids = bits.par_chunks(WORDS).enumerate().map(|(chunk, words)| {
-            let mut ids = Vec::new();
+        let count = |words: &[AtomicU64]| {
+            words.iter().map(|word| word.load(Ordering::Relaxed).count_ones() as usize).sum()
+        };
+        let counts: Vec<usize> = bits.par_chunks(WORDS).map(count).collect();
+        let mut ids = vec![0; counts.iter().sum()];
+        let mut rest = &mut ids[..];
+        let mut parts = Vec::with_capacity(counts.len());
+        for count in counts {
+            let (part, more) = rest.split_at_mut(count);
+            parts.push(part);
+            rest = more;
+        }
+        let chunks = parts.into_par_iter().zip(bits.par_chunks(WORDS)).enumerate();
+        chunks.for_each(|(chunk, (part, words))| {
+            let mut part = part.iter_mut();
             for (at, word) in (chunk * WORDS..).zip(words) {
                 let mut word = word.load(Ordering::Relaxed);
                 while word != 0 {
-                    ids.push(at as u32 * 64 + word.trailing_zeros());
+                    if let Some(id) = part.next() {
+                        *id = at as u32 * 64 + word.trailing_zeros();
+                    }
                     word &= word - 1;
                 }
             }
-            ids
         });
-        let parts: Vec<Vec<u32>> = ids.collect();
-        parts.concat()
+        ids
     }
 
     /// Number of them, in a scene of `count`.

@@ -283,6 +283,33 @@ pub(super) fn exp2_neg<S: Lanes>(simd: S, power: S::f32s) -> S::f32s {
     simd.transmute_f32s_u32s(simd.add_u32s(simd.transmute_u32s_f32s(mantissa), exponent))
 }
 
+/// log2(1 + r) over 0 <= r <= 1 to 2.2e-6, as r times a polynomial of r (least largest error, by
+/// Lawson's weights).
+const LOG_TERMS: [f32; 6] =
+    [1.442_553_2, -0.718_281_9, 0.458_270_76, -0.279_538, 0.123_451_36, -0.026_457_405];
+/// Its last bits count by one.
+const WHOLE: f32 = 8_388_608.0;
+
+/// The natural logarithm of finite numbers from 1 on, within 3e-6.
+#[inline(always)]
+pub(super) fn ln<S: Lanes>(simd: S, value: S::f32s) -> S::f32s {
+    let one = simd.splat_f32s(1.0);
+    let bits = simd.transmute_u32s_f32s(value);
+    let exponent = simd.wrapping_dyn_shr_u32s(bits, simd.splat_u32s(23));
+    let exponent = simd.or_u32s(exponent, simd.splat_u32s(WHOLE.to_bits()));
+    let biased = simd.splat_f32s(WHOLE + 127.0);
+    let exponent = simd.sub_f32s(simd.transmute_f32s_u32s(exponent), biased);
+    let mantissa = simd.and_u32s(bits, simd.splat_u32s(0x007f_ffff));
+    let mantissa = simd.or_u32s(mantissa, simd.splat_u32s(1.0_f32.to_bits()));
+    let rest = simd.sub_f32s(simd.transmute_f32s_u32s(mantissa), one);
+    let mut log = simd.splat_f32s(LOG_TERMS[LOG_TERMS.len() - 1]);
+    for &term in LOG_TERMS.iter().rev().skip(1) {
+        log = simd.fused(log, rest, simd.splat_f32s(term));
+    }
+    let log = simd.fused(log, rest, exponent);
+    simd.mul_f32s(log, simd.splat_f32s(std::f32::consts::LN_2))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -299,6 +326,35 @@ mod tests {
                 for i in 0..16 / S::F32_LANES {
                     simd.store(to, i, exp2_neg(simd, simd.load(from, i)));
                 }
+            }
+        }
+    }
+
+    struct Logarithms<'a>(&'a [[f32; 16]], &'a mut [[f32; 16]]);
+
+    impl LaneKernel for Logarithms<'_> {
+        #[inline(always)]
+        fn run<S: Lanes>(self, simd: S) {
+            for (from, to) in self.0.iter().zip(self.1) {
+                for i in 0..16 / S::F32_LANES {
+                    simd.store(to, i, ln(simd, simd.load(from, i)));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn logarithms_are_within_3e_6_at_every_width() {
+        let of = |i: usize| (1.0 + i as f32 * 1e-3).powi(1 + (i % 3) as i32);
+        let values: Vec<[f32; 16]> =
+            (0..20_000).map(|i| std::array::from_fn(|k| of(16 * i + k))).collect();
+        for width in Width::ALL.into_iter().filter(|width| width.available()) {
+            let mut got = vec![[0.0; 16]; values.len()];
+            width.run(Logarithms(&values, &mut got));
+            for (got, value) in got.iter().flatten().zip(values.iter().flatten()) {
+                let want = f64::from(*value).ln();
+                let most = 3e-6_f64.max(2e-7 * want);
+                assert!((f64::from(*got) - want).abs() < most, "{width:?}: ln {value} is {got}");
             }
         }
     }

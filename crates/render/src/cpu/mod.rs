@@ -20,8 +20,14 @@ mod sky;
 pub mod store;
 pub mod tiles;
 
-use std::{borrow::Cow, ops::Range, sync::Arc, time::Instant};
+use std::{
+    borrow::Cow,
+    ops::Range,
+    sync::{Arc, Weak},
+    time::Instant,
+};
 
+use parking_lot::Mutex;
 use rayon::prelude::*;
 
 use self::{
@@ -54,8 +60,9 @@ use crate::{
     scene::Gaussians,
 };
 
-/// Scratch of more Gaussians than this is freed after the frame instead of kept.
-const KEPT_GAUSSIANS_MAX: usize = 2 << 20;
+/// Scratch of more Gaussians than this is kept once, and as long as the scene lives that it was
+/// for.
+const SMALL_GAUSSIANS_MAX: usize = 2 << 20;
 /// Tasks of the blend for each thread: tiles differ much in their work.
 const TASKS_A_THREAD: usize = 16;
 
@@ -65,6 +72,8 @@ pub struct CpuRenderer {
     threads: Arc<rayon::ThreadPool>,
     /// Buffers between frames; one set for each frame drawn at the same time.
     frames: Pool<FrameScratch>,
+    /// One set for a large scene.
+    large: Mutex<Option<(Weak<()>, FrameScratch)>>,
     tiles: Pool<TileScratch>,
     backwards: Pool<BackwardScratch>,
     blocks: BlockCache,
@@ -111,6 +120,7 @@ impl CpuRenderer {
         Self {
             threads,
             frames: Pool::default(),
+            large: Mutex::default(),
             tiles: Pool::default(),
             backwards: Pool::default(),
             blocks: BlockCache::new(blocks_from(switches)),
@@ -126,10 +136,18 @@ impl CpuRenderer {
         request: &RenderRequest,
     ) -> Result<(Frame, Vec<DispatchTime>)> {
         let blocks = self.blocks.get(gaussians, request.detail > 0.0)?;
-        let mut scratch = self.frames.take();
+        let large = self
+            .large
+            .lock()
+            .take_if(|(life, _)| life.strong_count() == 0 || gaussians.len() > SMALL_GAUSSIANS_MAX);
+        let mut scratch = match large {
+            Some((_, scratch)) if gaussians.len() > SMALL_GAUSSIANS_MAX => scratch,
+            _ => self.frames.take(),
+        };
         let timed = self.draw_into(gaussians, blocks.as_deref(), request, &mut scratch)?;
-        if scratch.projected.footprints.len() <= KEPT_GAUSSIANS_MAX {
-            self.frames.give(scratch);
+        match scratch.projected.footprints.capacity() > SMALL_GAUSSIANS_MAX {
+            true => *self.large.lock() = Some((gaussians.life(), scratch)),
+            false => self.frames.give(scratch),
         }
         Ok(timed)
     }

@@ -69,11 +69,15 @@ impl<'a> Paint<'a> {
         [depth, label, label + if blend { BLEND_WIDTH } else { 0 }]
     }
 
-    /// The channels of Gaussian `id`.
+    /// Writes the channels of Gaussian `id`, as many as the layout has.
     #[inline(always)]
-    pub(super) fn channels(&self, footprint: &Footprint, id: usize) -> [f32; CHANNELS] {
+    pub(super) fn put_channels(
+        &self,
+        footprint: &Footprint,
+        id: usize,
+        channels: &mut [f32; CHANNELS],
+    ) {
         let [depth, label, _] = self.layout();
-        let mut channels = [0.0; CHANNELS];
         if self.kinds.color {
             channels[..3].copy_from_slice(&footprint.color);
         }
@@ -84,6 +88,5 @@ impl<'a> Paint<'a> {
             let row = Labels::row(table, self.entries[id]);
             channels[label..label + BLEND_WIDTH].copy_from_slice(&row);
         }
-        channels
     }
 }

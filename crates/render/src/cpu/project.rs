@@ -9,9 +9,10 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::{
+    cell::Numbers,
     cull::Shown,
     footprint::Footprint,
-    lanes::{KernelOptions, LaneKernel, Lanes, Row, Wide},
+    lanes::{KernelOptions, LaneKernel, Lanes, Row, Wide, ln},
     tiles::{BLOCK, Ellipses, Grid, TileSpans},
 };
 use crate::{
@@ -23,6 +24,8 @@ use crate::{
 
 /// Gaussians of a task: enough to hide the cost of a task, few enough to balance two cores.
 const CHUNK: usize = 1024;
+/// Numbers that a task writes into new scratch.
+const FRESH: usize = 1 << 14;
 
 /// Output of the stage, `[N]` each.
 #[derive(Debug, Default)]
@@ -49,9 +52,9 @@ pub fn project(
     let Projected { shown, footprints, tile_spans, tiles_per_gauss } = projected;
     let count = shown.len(gaussians.len());
     let shown = &*shown;
-    footprints.resize(count, Footprint::default());
-    tile_spans.resize(count, TileSpans::default());
-    tiles_per_gauss.resize(count, 0);
+    resize(footprints, count);
+    resize(tile_spans, count);
+    resize(tiles_per_gauss, count);
     let chunks = footprints
         .par_chunks_mut(CHUNK)
         .zip(tile_spans.par_chunks_mut(CHUNK))
@@ -61,6 +64,18 @@ pub fn project(
         let out = (footprints, spans, tiles);
         options.width.run(Chunk { gaussians, shown, request, view, options, first, out });
     });
+}
+
+/// Sets the length of scratch. What is new is written by all threads: for millions of Gaussians
+/// most of the time goes to pages that the system gives to whom writes them first.
+fn resize<T: Default + Send>(scratch: &mut Vec<T>, count: usize) {
+    if count > scratch.capacity() {
+        // Nothing in it has to be copied.
+        *scratch = Vec::with_capacity(count);
+    }
+    scratch.truncate(count);
+    let more = (scratch.len()..count).into_par_iter().with_min_len(FRESH);
+    scratch.par_extend(more.map(|_| T::default()));
 }
 
 /// Gaussians of a task and where their footprints go.
@@ -99,11 +114,11 @@ impl LaneKernel for Chunk<'_> {
             if !block.project(simd, view, block_options) {
                 continue;
             }
+            block.bound_powers(simd);
             let mut seen = 0_u32;
             for (k, footprint) in footprints.iter_mut().enumerate() {
-                if let Some(found) = block.footprint(k) {
-                    *footprint = found;
-                    ellipses.set(k, &found);
+                if block.put_footprint(k, footprint) {
+                    ellipses.set(k, footprint);
                     seen |= 1 << k;
                 }
             }
@@ -143,6 +158,8 @@ struct Block {
     conic_x: Row,
     conic_y: Row,
     depth: Row,
+    /// Half the squared distance at which alpha reaches 1/255, with slack.
+    power_max: Numbers,
     /// 1 for a Gaussian that may be visible, else 0.
     kept: Row,
 }
@@ -333,32 +350,46 @@ impl Block {
         any_kept
     }
 
-    /// The footprint of Gaussian `k`; `None` if it is not visible.
+    /// Where the alphas of all reach 1/255.
     #[inline(always)]
-    fn footprint(&self, k: usize) -> Option<Footprint> {
+    fn bound_powers<S: Lanes>(&mut self, simd: S) {
+        let mut over = Numbers::ZERO;
+        for (over, &opacity) in over.0.iter_mut().zip(&self.opacity) {
+            *over = opacity as f32 * ALPHA_MIN.recip();
+        }
+        for i in 0..BLOCK / S::F32_LANES {
+            let ln = ln(simd, simd.max_f32s(over.at(simd, i), simd.splat_f32s(1.0)));
+            let bound = simd.add_f32s(ln, simd.splat_f32s(FOOTPRINT_SLACK));
+            self.power_max.put(simd, i, bound);
+        }
+    }
+
+    /// Writes the footprint of Gaussian `k`, less its colour. Returns false if it is not visible.
+    #[inline(always)]
+    fn put_footprint(&self, k: usize, to: &mut Footprint) -> bool {
         // The comparison is false for a NaN.
         let seen = self.kept[k] > 0.0 && self.opacity[k] >= f64::from(ALPHA_MIN);
         if !seen {
-            return None;
+            return false;
         }
-        let opacity = self.opacity[k] as f32;
-        let footprint = Footprint {
-            mean: [self.center[0][k], self.center[1][k]],
-            conic_shear: self.conic_shear[k],
-            conic_x: self.conic_x[k] as f32,
-            conic_y: self.conic_y[k] as f32,
-            power_max: (opacity / ALPHA_MIN).ln().max(0.0) + FOOTPRINT_SLACK,
-            opacity,
-            depth: self.depth[k] as f32,
-            color: [0.0; 3],
-        };
+        let (x, y, shear) = (self.center[0][k], self.center[1][k], self.conic_shear[k]);
+        let (conic_x, conic_y) = (self.conic_x[k] as f32, self.conic_y[k] as f32);
+        let depth = self.depth[k] as f32;
         // Infinite variances and determinants give a 0 or a NaN here.
-        let finite = footprint.mean[0].is_finite()
-            && footprint.mean[1].is_finite()
-            && footprint.conic_shear.is_finite()
-            && footprint.depth.is_finite();
+        let finite = x.is_finite() && y.is_finite() && shear.is_finite() && depth.is_finite();
         let wide = |inv: f32| inv > 0.0 && inv.is_finite();
-        (finite && wide(footprint.conic_x) && wide(footprint.conic_y)).then_some(footprint)
+        if !(finite && wide(conic_x) && wide(conic_y)) {
+            return false;
+        }
+        // Number by number: a whole one would wait for its parts.
+        to.mean = [x, y];
+        to.conic_shear = shear;
+        to.conic_x = conic_x;
+        to.conic_y = conic_y;
+        to.power_max = self.power_max.0[k];
+        to.opacity = self.opacity[k] as f32;
+        to.depth = depth;
+        true
     }
 }
 

@@ -113,12 +113,12 @@ impl Blend<'_> {
             let staged = &mut scratch.staged[..batch.len()];
             for ((staged, footprint), &isect) in staged.iter_mut().zip(fetched).zip(batch) {
                 let id = value(isect) as usize;
-                let bin = match WEIGHTS {
+                stage(footprint, tile, staged);
+                paint.put_channels(footprint, id, &mut staged.channels);
+                staged.bin = match WEIGHTS {
                     true => scratch.bins.bin_of[usize::from(paint.entries[id])],
                     false => NO_BIN,
                 };
-                let channels = paint.channels(footprint, id);
-                *staged = stage(footprint, tile, channels, bin);
             }
             let groups = staged.chunks(GROUP).zip(&mut scratch.marks);
             for (group, marks) in groups {
@@ -232,30 +232,22 @@ fn clear(cells: &mut [Cell; CELLS], tile: Tile) -> u32 {
     open
 }
 
-/// The footprint, relative to the tile. Computed in f64; the small results become f32.
+/// The footprint, relative to the tile; channels and bin stay. Computed in f64; the small results
+/// become f32. Written number by number: a whole one would wait for its parts.
 #[inline(always)]
-pub(super) fn stage(
-    footprint: &Footprint,
-    tile: Tile,
-    channels: [f32; CHANNELS],
-    bin: u32,
-) -> Staged {
+pub(super) fn stage(footprint: &Footprint, tile: Tile, staged: &mut Staged) {
     let half = f64::from(TILE_SIZE) / 2.0;
     let x = footprint.mean[0] - (f64::from(tile.x) + half);
     let y = footprint.mean[1] - (f64::from(tile.y) + half);
     let ux = f64::from(footprint.conic_x) * SQRT_LOG2_E;
     let vy = f64::from(footprint.conic_y) * SQRT_LOG2_E;
-    Staged {
-        ux: ux as f32,
-        uy: (-ux * footprint.conic_shear) as f32,
-        u0: (-ux * (x - footprint.conic_shear * y)) as f32,
-        vy: vy as f32,
-        v0: (-vy * y) as f32,
-        power_max: footprint.power_max * std::f32::consts::LOG2_E + POWER_SLACK,
-        opacity: footprint.opacity,
-        channels,
-        bin,
-    }
+    staged.ux = ux as f32;
+    staged.uy = (-ux * footprint.conic_shear) as f32;
+    staged.u0 = (-ux * (x - footprint.conic_shear * y)) as f32;
+    staged.vy = vy as f32;
+    staged.v0 = (-vy * y) as f32;
+    staged.power_max = footprint.power_max * std::f32::consts::LOG2_E + POWER_SLACK;
+    staged.opacity = footprint.opacity;
 }
 
 /// One bit for each cell that the ellipse may touch. In a cell, u and v stay within a box. Its

@@ -49,10 +49,12 @@ impl Grid {
     }
 }
 
-/// The result of [`touched_tiles`] for a footprint of at most two rows of tiles. Most are. The
-/// emission reads it: in depth order these 12 bytes stay in the cache, footprints do not.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+/// The result of [`touched_tiles`] for a footprint of at most two rows of tiles, which most are, and
+/// its depth: all that a pair of a tile and a Gaussian needs, in 16 bytes instead of 64.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TileSpans {
+    /// Depth of the footprint.
+    pub(super) depth: f32,
     /// First row of tiles touched.
     first_row: u16,
     /// Rows touched; more than two are not kept.
@@ -65,7 +67,7 @@ impl TileSpans {
     /// Calls [`touched_tiles`] once. Returns the spans and the number of tiles.
     #[inline]
     pub fn of(footprint: &Footprint, grid: &Grid) -> (Self, u32) {
-        let mut kept = Self::default();
+        let mut kept = Self { depth: footprint.depth, ..Self::default() };
         let mut count = 0;
         touched_tiles(footprint, grid, |tile_y, tiles| {
             count += tiles.end - tiles.start;
@@ -214,7 +216,7 @@ impl Ellipses {
         if end - first > 2.0 {
             return TileSpans::of(footprint, grid);
         }
-        let mut kept = TileSpans::default();
+        let mut kept = TileSpans { depth: footprint.depth, ..TileSpans::default() };
         if end <= first {
             return (kept, 0);
         }
