@@ -9,6 +9,7 @@
 mod boxes;
 pub mod labels;
 pub mod pca;
+mod split;
 pub mod tally;
 mod views;
 
@@ -57,6 +58,10 @@ pub(crate) struct Args {
     /// Judge the boxes of parts in space in place of masks, of scenes that `make eval-scenes` made
     #[arg(long, conflicts_with = "overlap")]
     boxes: bool,
+    /// Say of each word in each view where its pixels are lost: outlined in photos, lifted to the
+    /// scene, named by its best entry, selected
+    #[arg(long, conflicts_with = "boxes")]
+    split: bool,
     /// Words for what is in no scene, separated by commas
     #[arg(long, value_delimiter = ',', default_value = ABSENT)]
     absent: Vec<String>,
@@ -208,6 +213,7 @@ fn judge(
         most => scene.frames.len().div_ceil(most).max(1),
     };
     let (mut targets, mut left_out, mut pictures) = (Vec::new(), Vec::new(), Vec::new());
+    let mut lost = Vec::new();
     let asked: Vec<usize> = scene.frames.iter().step_by(every).map(|frame| frame.photo).collect();
     let given = spread(scene.photos.len(), &asked, args.inputs.photos);
     if args.spread && given.len() < 2 {
@@ -240,6 +246,9 @@ fn judge(
                     .and_then(|made| tools.see(&made, target, true)),
             };
             let seen = seen.map_err(fault)?;
+            if args.split {
+                lost.append(&mut seen.split(scene, frame, &way.scoring, &texts)?);
+            }
             for (tally, bank) in tallies.iter_mut().zip(&seen.banks) {
                 let maps = bank.maps(&way.scoring, &texts)?;
                 tally.add(&frame.label, &maps);
@@ -261,8 +270,12 @@ fn judge(
     if let Some(out) = &args.pictures {
         grid::write(out, name, &pictures.iter().collect::<Vec<_>>())?;
     }
-    let row =
+    let mut row =
         json!({ "scene": name, "use": use_of(name), "targets": targets, "left_out": left_out });
+    if args.split {
+        split::told(&lost).iter().for_each(|line| progress(line));
+        row["split"] = json!(lost);
+    }
     Ok((row, tallies))
 }
 

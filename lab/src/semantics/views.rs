@@ -3,10 +3,14 @@
 
 use std::sync::{Arc, atomic::AtomicBool};
 
-use segsplat_vision::semantics::{Cutter, Scorer, Scoring, add_context, contexts};
+use segsplat_vision::semantics::{Cutter, Scorer, Scoring, TextScores, add_context, contexts};
 use serde_json::{Value, json};
 
-use super::{pca, tally::TextMap};
+use super::{
+    labels::{LabelledFrame, LabelledScene},
+    pca, split,
+    tally::TextMap,
+};
 use crate::{
     error::{Error, Result},
     models::ImageText,
@@ -18,8 +22,8 @@ use crate::{
         Kinds, Labels, PixelWeights, RenderRequest, Renderer, cpu::CpuRenderer, plan::served,
     },
     scene::{
-        Bank, Camera, Crop, Method, PhotoMasks, PosedPhoto, RowViews, Scene, SceneOptions,
-        SemanticsReport, Watch,
+        Bank, Camera, Crop, IndexMap, Method, PhotoMasks, PosedPhoto, RowViews, Scene,
+        SceneOptions, SemanticsReport, Watch,
     },
     scenes::{make, scene_of, view_request},
 };
@@ -44,6 +48,8 @@ pub(super) struct Made {
     pub(super) scene: Scene,
     pub(super) bank: Bank,
     pub(super) views: RowViews,
+    /// Entries of each photo's cells.
+    maps: Vec<IndexMap>,
     meaning: SemanticsReport,
 }
 
@@ -56,6 +62,8 @@ pub(super) struct Seen {
     pub(super) report: Value,
     /// The view of the scene, and the nearest photo taken for the target, where that was asked for.
     pub(super) banks: Vec<BankView>,
+    /// Files of the inputs, and the entries of their cells.
+    outlined: Vec<(String, IndexMap)>,
 }
 
 /// A bank and the weights of each pixel of the target over it.
@@ -96,13 +104,14 @@ impl<'a> Tools<'a> {
             scene,
             bank: meaning.bank,
             views: meaning.views,
+            maps: meaning.photos,
             meaning: meaning.report,
         })
     }
 
     /// Looks at a scene from the target's camera; with `flat` also at its first photo alone.
     pub(super) fn see(&self, made: &Made, target: &PosedPhoto, flat: bool) -> Result<Seen> {
-        let Made { given, method, scene, bank, views, meaning } = made;
+        let Made { given, method, scene, bank, views, maps, meaning } = made;
         let plain = view_request(target.camera, Kinds::COLOR, scene.meta.report.median_depth);
         let request = RenderRequest { labels: Labels::Weights, ..plain };
         let frame = self.renderer.render(&scene.gaussians, &served(scene, request))?;
@@ -121,7 +130,9 @@ impl<'a> Tools<'a> {
             let cancel = AtomicBool::new(false);
             banks.push(self.flat(nearest, &target.camera, method, &cancel)?);
         }
-        Ok(Seen { color: frame.color.unwrap_or_default(), banks, report })
+        let photos = given.iter().zip(maps);
+        let outlined = photos.map(|(photo, map)| (photo.file.clone(), map.clone())).collect();
+        Ok(Seen { color: frame.color.unwrap_or_default(), banks, outlined, report })
     }
 
     /// The masks of one photo, each with a row of its own, laid over a picture of the size of the
@@ -173,6 +184,27 @@ impl<'a> Tools<'a> {
         }
         let bank = Bank { dim: manifest.dim, rows };
         Ok(BankView { bank, views: RowViews::default(), weights })
+    }
+}
+
+impl Seen {
+    /// Where the pixels of each asked class are lost in this view.
+    pub(super) fn split(
+        &self,
+        scene: &LabelledScene,
+        target: &LabelledFrame,
+        scoring: &Arc<Scoring>,
+        texts: &[Vec<f32>],
+    ) -> Result<Vec<Value>> {
+        let BankView { bank, views, weights } = &self.banks[0];
+        let scorer = Scorer::new(bank, Arc::clone(scoring))?.with_views(views)?;
+        let scored = |text: &Vec<f32>| -> Result<(TextScores, Vec<bool>)> {
+            let scores = scorer.text(text)?;
+            let mask = scorer.mask(&scores, weights)?;
+            Ok((scores, mask))
+        };
+        let asked = texts.iter().map(scored).collect::<Result<Vec<_>>>()?;
+        Ok(split::of_view(scene, target, &self.outlined, weights, &asked))
     }
 }
 

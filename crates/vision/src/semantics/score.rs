@@ -145,6 +145,21 @@ impl TextScores {
         self.nearer[row + 1] = u64::MAX;
     }
 
+    /// Entries count against a text by no more than the best one, which fits it by `best`, counts
+    /// for it: else those beside an entry that is barely taken take its edges away.
+    fn keep_edges(&mut self, best: f64) {
+        let over = best - self.margin;
+        if over <= 0.0 {
+            return;
+        }
+        let least = self.margin - over;
+        for rows in &mut self.groups {
+            for (row, norm) in rows.iter_mut().skip(1).zip(&*self.norms) {
+                row[1..].iter_mut().for_each(|score| *score = score.max(least * norm));
+            }
+        }
+    }
+
     /// The scores of a text that says nothing: no entry fits it.
     #[must_use]
     pub fn silent(mut self) -> Self {
@@ -360,6 +375,9 @@ impl Scorer {
                 *lead = LEFT_OUT;
                 text.leave_out(row);
             }
+        }
+        if self.views.is_some() {
+            text.keep_edges(best);
         }
         text.relevancies.extend(leads.iter().map(|lead| self.sharpen(*lead)));
         Ok(text)

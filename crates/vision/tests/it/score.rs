@@ -391,3 +391,29 @@ fn views_of_another_bank_are_refused() {
         assert!(scorer.with_views(&RowViews { entries, rows }).is_err());
     }
 }
+
+#[test]
+fn the_edge_of_what_is_taken_lies_where_it_weighs_most_however_little_it_fits() {
+    // 44 degrees is barely nearer to X than to Y, 170 not at all.
+    let scorer = seen(&[&[44.0], &[170.0]]);
+    let text = scorer.text(&X).unwrap();
+    assert_eq!([1, 2].map(|m| text.selects(m)), [true, false]);
+    let pixel = |share: f32| PixelWeights {
+        offsets: vec![0, 2],
+        entries: vec![1, 2],
+        weights: vec![share, 1.0 - share],
+    };
+    let takes = |text, share| scorer.mask(text, &pixel(share)).unwrap()[0];
+    assert_eq!([0.55, 0.45].map(|share| takes(&text, share)), [true, false]);
+    // Without masks beside its rows a bank is blended as the paper does.
+    let bank = Bank { dim: 2, rows: [at(44.0), at(170.0)].concat() };
+    let plain = Scorer::new(&bank, all_over_the_canon(&[Y])).unwrap();
+    let text = plain.text(&X).unwrap();
+    assert!(!plain.mask(&text, &pixel(0.55)).unwrap()[0]);
+    // Nothing is taken, so nothing counts less against it.
+    let text = scorer.text(&at(170.0)).unwrap();
+    assert_eq!([1, 2].map(|m| text.selects(m)), [false, true]);
+    assert!(!takes(&text, 0.55) && takes(&text, 0.45));
+    let text = scorer.text(&at(250.0)).unwrap();
+    assert!(!takes(&text, 0.9) && !takes(&text, 0.1));
+}
