@@ -3,7 +3,7 @@
     python captures.py --mirror FOLDER --out data [--only NAME ...]
 
 FOLDER holds bare git copies of the repositories in `captures.json` (`owner+name/repo`), which also
-says where each comes from, its licence, and whether its place is held out. Each capture becomes
+says where each comes from, its licence, and whether its place is held out; `solved` needs pycolmap. Each capture becomes
 `data/<name>/<number>.jpg` and `data/<name>/cameras.json`: width, height, K in pixels and OpenCV
 camera-to-world of each photo, world units of the source. Nothing here is under evaluation.
 """
@@ -14,6 +14,7 @@ import os
 import re
 import struct
 import subprocess
+import tempfile
 from dataclasses import dataclass, field
 
 import cv2
@@ -23,6 +24,8 @@ from PIL import Image
 HERE = os.path.dirname(os.path.abspath(__file__))
 LONG_SIDE = 640
 QUALITY = 90
+SOLVE_SIDE = 1000
+EXHAUSTIVE_MOST = 40  # photos; more are taken as frames of a walk
 
 
 @dataclass
@@ -157,7 +160,49 @@ def tsdf(tree, source):
         yield Shot(path, (640, 480), K, c2w)
 
 
-LAYOUTS = {f.__name__: f for f in (transforms, colmap, strecha, llff, neus, tsdf)}
+def solved(tree, source):
+    """Photos without cameras, solved by COLMAP at 1,000 pixels: one lens with a radial term for all of one size."""
+    import pycolmap
+
+    names = tree.under(source["photos"], source.get("pattern", r"[^/]+\.(jpg|JPG|jpeg|png)"))[:: source.get("every", 1)]
+    names = names[: source.get("most", len(names))]
+    with tempfile.TemporaryDirectory() as work:
+        size, where = {}, {}
+        for n, path in enumerate(names):
+            img, name = Image.open(io.BytesIO(tree.read(path))), f"{n:03d}.png"
+            size[name], where[name] = img.size, path
+            img.draft("RGB", (SOLVE_SIDE, SOLVE_SIDE))
+            img = img.convert("RGB")
+            img.thumbnail((SOLVE_SIDE, SOLVE_SIDE))
+            img.save(os.path.join(work, name))
+        base = os.path.join(work, "base.db")
+        found = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
+        found.sift.max_num_features = 4096
+        matched = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
+        mode = pycolmap.CameraMode.AUTO if len(set(size.values())) == 1 else pycolmap.CameraMode.PER_IMAGE
+        pycolmap.extract_features(base, work, camera_mode=mode, reader_options=pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL"),
+                                  extraction_options=found, device=pycolmap.Device.cpu)
+        if len(names) > EXHAUSTIVE_MOST:
+            pairing = pycolmap.SequentialPairingOptions(overlap=8, quadratic_overlap=True)
+            pycolmap.match_sequential(base, matching_options=matched, pairing_options=pairing, device=pycolmap.Device.cpu)
+        else:
+            pycolmap.match_exhaustive(base, matching_options=matched, device=pycolmap.Device.cpu)
+        models = pycolmap.incremental_mapping(base, work, os.path.join(work, "out"), pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=1))
+        best = max(models.values(), key=lambda m: m.num_reg_images())
+        print(f"{source['name']}: {best.num_reg_images()} of {len(names)} solved, {best.compute_mean_reprojection_error():.2f} px", flush=True)
+        for image in best.images.values():
+            if not image.has_pose:
+                continue
+            camera, m = best.cameras[image.camera_id], np.eye(4)
+            m[:3] = image.cam_from_world().inverse().matrix()
+            w, h = size[image.name]
+            s = w / camera.width
+            f, cx, cy, k = camera.params
+            K = lens(f * s, f * h / camera.height, cx * s, cy * h / camera.height)
+            yield Shot(where[image.name], (w, h), K, m, [k, 0.0, 0.0, 0.0, 0.0])
+
+
+LAYOUTS = {f.__name__: f for f in (transforms, colmap, strecha, llff, neus, tsdf, solved)}
 
 
 # ---- small copies -------------------------------------------------------------------------------

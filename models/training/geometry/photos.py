@@ -43,8 +43,14 @@ class Capture:
         self.gain = pairs["gain"][keep][:, ::-1].clip(-GAIN_MOST, GAIN_MOST)  # BGR there
         c = self.c2w[:, :3, 3]
         self.distance = np.linalg.norm(c[:, None] - c[None], axis=2)
-        self.ranges = self.measured(device)
-        self.triples = self.by_angle()
+        known = os.path.join(folder, "known.npz")
+        if os.path.exists(known):  # of an earlier run
+            known = np.load(known)
+            self.ranges, self.triples = known["ranges"], [known[f"triples_{n}"] for n in range(len(SHARES))]
+            return
+        self.ranges, self.triples = self.measured(device), self.by_angle()
+        np.savez(known[:-4] + f"-{os.getpid()}.npz", ranges=self.ranges, **{f"triples_{n}": t for n, t in enumerate(self.triples)})
+        os.replace(known[:-4] + f"-{os.getpid()}.npz", known)
 
     def measured(self, device):
         """[N,2] farthest and nearest inverse depth: of the sparse points and of a sweep."""

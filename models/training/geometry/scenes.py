@@ -270,7 +270,9 @@ class World:
         pos = torch.zeros(B, N, 3, device=self.device)
         pos[:, 0], pos[:, 1] = -side / 2, side / 2
         if V > 2:
-            pos[:, 2:V] = ball(B, V - 2) * squash * b[:, None, None] * 1.1
+            # More than four photos lie along a longer walk.
+            far = self.logu(B, 1, 1, lo=1.1, hi=1.1 if V <= 4 else 2.5)
+            pos[:, 2:V] = ball(B, V - 2) * squash * b[:, None, None] * far
         # Most targets lie between the inputs, some well outside: nothing may smear there either.
         reach = torch.where(self.coin(B, T, 1, p=0.85), 0.45, 1.0)
         pos[:, V:] = ball(B, T) * squash * reach * b[:, None, None] + side[:, None] * self.u(B, T, 1, lo=-0.2, hi=0.2)

@@ -26,11 +26,11 @@ def weights_of(run):
     return torch.load(io.BytesIO(b"".join(open(p, "rb").read() for p in parts)), map_location="cpu")
 
 
-def mixes(count):
+def mixes(count, start_shares=START_SHARES):
     """Shares of the start and of each run: the start, each run, each pair, all; the start in it, too."""
     groups = [c for n in (1, 2, count) for c in itertools.combinations(range(count), n)]
     found = [[1.0] + [0.0] * count]
-    for share in START_SHARES:
+    for share in start_shares:
         for group in dict.fromkeys(groups):
             found.append([share] + [(1 - share) / len(group) if i in group else 0.0 for i in range(count)])
     return found
@@ -45,14 +45,14 @@ def judged(args, states):
     from model import GeometryNet
 
     part, parts = (int(x) for x in args.part.split("/"))
-    device = torch.device("cuda", part) if torch.cuda.is_available() else torch.device("cpu")
+    device = torch.device("cuda", part if args.gpu is None else args.gpu) if torch.cuda.is_available() else torch.device("cpu")
     if device.type == "cuda":
         torch.cuda.set_device(device)
     held_out = [os.path.dirname(p) for p in sorted(glob.glob(os.path.join(args.data, "*", "cameras.json"))) if '"held_out": true' in open(p).read(400)]
-    judge = Judge(args.scenes, held_out, device, [2])
+    judge = Judge(args.scenes, held_out, device, args.views)
     net = GeometryNet().to(device).eval()
     with open(os.path.join(args.out, f"soup-{part}.jsonl"), "w") as file:
-        for shares in mixes(len(args.runs))[part::parts]:
+        for shares in mixes(len(args.runs), args.start_shares)[part::parts]:
             net.load_state_dict(mixed(states, shares))
             uses, scenes = judge.figures(net, args.every)
             line = json.dumps({"shares": shares, "uses": uses, "scenes": scenes})
@@ -62,8 +62,8 @@ def judged(args, states):
 
 
 def score(row):
-    """PSNR and SSIM of both groups; a hundredth of SSIM is worth a tenth of a dB."""
-    groups = [row["uses"][use] for use in ("choose/2", "held_out/2") if use in row["uses"]]
+    """PSNR and SSIM of the groups; a hundredth of SSIM is worth a tenth of a dB."""
+    groups = [figures for use, figures in row["uses"].items() if use.startswith(("choose/", "held_out/"))]
     return sum(g[0] + 10 * g[1] for g in groups) / len(groups)
 
 
@@ -84,6 +84,9 @@ def main():
     ap.add_argument("--scenes")
     ap.add_argument("--data")
     ap.add_argument("--every", type=int, default=1)
+    ap.add_argument("--views", type=int, nargs="*", default=[2], help="photos of the sets that are judged")
+    ap.add_argument("--start-shares", type=float, nargs="*", default=START_SHARES)
+    ap.add_argument("--gpu", type=int, help="device, where it is not the number of the part")
     ap.add_argument("--part", help="I/N: this process judges every Nth mix")
     ap.add_argument("--pick", type=int, default=0)
     args = ap.parse_args()
