@@ -17,23 +17,24 @@ use crate::{
     metrics::{clamped, psnr, ssim},
     photo_files,
     pipeline::{
-        Pipeline, growth,
-        refinement::{RefineCalls, refined},
+        Pipeline, growth, ignored,
+        refinement::{RefineCalls, at_side, refined},
     },
-    refine::{ALIGNING_STEPS, RefinedVersion, aligned, held_out},
+    refine::{ALIGNING_STEPS, RefinedVersion, TRANSIENT_SIDE, aligned, held_out, transient},
     refinements::Variant,
     render::{
-        Background, Frame, Kinds, RenderRequest, Renderer, Switches,
+        Background, DifferentiableRenderer, Frame, Kinds, RenderRequest, Renderer, Switches,
         plan::{default_near, served},
         train::{pose::moved, unit},
     },
     rows::{Rows, ms, progress},
     scene::{Camera, CameraToWorld, Gaussians, PosedPhoto, Scene, SceneOptions},
     scenes::{
-        is_posed, make_for_refinement, make_keeping, make_more, recast, scene_of, spread, use_of,
-        view_request,
+        SILENT, is_posed, make_for_refinement, make_keeping, make_more, recast, scene_of, spread,
+        use_of, view_request,
     },
     setup::Inputs,
+    words::paste::{self, Pasted},
 };
 
 /// Every so many photos one is a target, from this one on.
@@ -58,6 +59,15 @@ pub(crate) struct Args {
     /// So many of the given photos join the scene of all others: how good it is before and after
     #[arg(long, conflicts_with_all = ["refine", "disturb"])]
     join: Option<usize>,
+    /// Also with cut-outs of this tar (`images/`, `masks/`) pasted into every third given photo
+    #[arg(long, value_name = "TAR")]
+    paste: Option<PathBuf>,
+    /// What these words name is left out of the given photos
+    #[arg(long, value_name = "WORD")]
+    ignore: Vec<String>,
+    /// Not without what is disturbed or pasted
+    #[arg(long)]
+    only_changed: bool,
     /// Folder whose files replace the built-in shaders
     #[arg(long)]
     shaders: Option<PathBuf>,
@@ -92,11 +102,32 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         }
         let wrong = args.disturb.as_deref().map(|at| [at[0], at[1]]);
         let mut median_depth = 1.0;
-        for wrong in [None].into_iter().chain(wrong.map(Some)) {
-            let given: Vec<PosedPhoto> = match wrong {
-                None => right.clone(),
-                Some([degrees, share]) => disturbed(&right, degrees, share * median_depth),
+        let kinds = [None].into_iter().chain(wrong.map(Some)).map(|wrong| (wrong, None));
+        let kinds = kinds.chain(args.paste.as_ref().map(|tar| (None, Some(tar))));
+        let is_changed = |(wrong, tar): &(Option<[f64; 2]>, Option<&PathBuf>)| {
+            !args.only_changed || wrong.is_some() || tar.is_some()
+        };
+        for (wrong, tar) in kinds.filter(is_changed) {
+            let pasted: Vec<Pasted> = match tar {
+                None => right.iter().map(|posed| (posed.clone(), None)).collect(),
+                Some(tar) => paste::pasted(&right, tar)?,
             };
+            let (mut given, pasted): (Vec<PosedPhoto>, Vec<_>) = pasted.into_iter().unzip();
+            if let Some([degrees, share]) = wrong {
+                given = disturbed(&right, degrees, share * median_depth);
+            }
+            let searched = Instant::now();
+            if !args.ignore.is_empty() {
+                ignored::leave_out_words(
+                    &engine,
+                    &mut given,
+                    &args.ignore,
+                    &scene_options.method(),
+                    SILENT,
+                )?;
+            }
+            let ignored = left_out(&given, &pasted);
+            let ignore_ms = ms(searched);
             let begun = Instant::now();
             let (made, seen) = make_keeping(&engine, &given, &scene_options)?;
             let scene = scene_of(made);
@@ -141,6 +172,11 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
                 "first_psnr": judge(&first)?,
                 "served_psnr": mean_psnr(&targets, as_served)?,
                 "disturb": wrong,
+                "paste": tar.is_some(),
+                "ignore": args.ignore,
+                "ignored": ignored,
+                "ignore_ms": ignore_ms,
+                "transient": shown_alone(&*renderer, &scene, &first, &given, &pasted)?,
                 "peak_mib": peak_mib(),
             });
             if variants.is_empty() {
@@ -216,6 +252,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
                 row["steps"] = json!(found.report.steps);
                 row["overfit"] = json!(found.overfit);
                 row["pose_gain"] = json!(found.pose_gain);
+                row["transient_gain"] = json!(found.transient_gain);
+                row["left_out"] = json!(found.report.transient);
                 row["moved"] = json!(found.report.cameras);
                 row["held_out"] = json!(held_out(given.len()));
                 row["own_psnr_before"] = json!(found.report.psnr_before);
@@ -305,6 +343,38 @@ fn disturbed(photos: &[PosedPhoto], degrees: f64, way: f64) -> Vec<PosedPhoto> {
         PosedPhoto { camera: Camera { camera_to_world, ..posed.camera }, ..posed.clone() }
     };
     photos.iter().map(wrong).collect()
+}
+
+/// Share of the pasted pixels that are left out of the photos, and of the others.
+fn left_out(photos: &[PosedPhoto], pasted: &[Option<Vec<bool>>]) -> [f64; 2] {
+    let mut counts = [[0_u64; 2]; 2];
+    for (posed, pasted) in photos.iter().zip(pasted) {
+        for i in 0..posed.photo.rgb.len() / 3 {
+            let kind = usize::from(pasted.as_ref().is_none_or(|pasted| !pasted[i]));
+            counts[kind][0] += 1;
+            counts[kind][1] += u64::from(posed.photo.valid.as_ref().is_some_and(|v| !v[i]));
+        }
+    }
+    counts.map(|[all, out]| out as f64 / all.max(1) as f64)
+}
+
+/// The same of what photos show alone before the first step.
+fn shown_alone(
+    renderer: &dyn DifferentiableRenderer,
+    scene: &Scene,
+    gaussians: &Gaussians,
+    photos: &[PosedPhoto],
+    pasted: &[Option<Vec<bool>>],
+) -> Result<[f64; 2]> {
+    let small: Vec<PosedPhoto> =
+        photos.iter().map(|posed| at_side(posed, TRANSIENT_SIDE)).collect();
+    let maps = transient(renderer, scene, gaussians, &small)?;
+    let mut photos = photos.to_vec();
+    photos.iter_mut().zip(&maps).for_each(|(posed, map)| {
+        posed.photo.valid = None;
+        posed.photo.leave_out(map);
+    });
+    Ok(left_out(&photos, pasted))
 }
 
 fn poses_of(photos: &[PosedPhoto]) -> Vec<CameraToWorld> {

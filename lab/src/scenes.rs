@@ -200,7 +200,7 @@ pub(crate) fn recast(
 }
 
 static NEVER: AtomicBool = AtomicBool::new(false);
-const SILENT: Watch<'static> = Watch { progress: &|_, _| (), cancel: &NEVER };
+pub(crate) const SILENT: Watch<'static> = Watch { progress: &|_, _| (), cancel: &NEVER };
 
 /// A scene that is not stored.
 pub(crate) fn scene_of(reconstruction: Reconstruction) -> Scene {

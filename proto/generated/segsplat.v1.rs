@@ -751,6 +751,9 @@ pub struct CreateSceneHeader {
     /// Whether the cameras of the upload are used, or solved from the photos.
     #[prost(enumeration = "CamerasMode", tag = "11")]
     pub cameras_mode: i32,
+    /// Words whose things take no part in the scene: what is found of them in the photos is left out.
+    #[prost(string, repeated, tag = "12")]
+    pub ignore: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
     /// Camera description; left out when it is among the files or in the archive.
     #[prost(oneof = "create_scene_header::Cameras", tags = "1, 2")]
     pub cameras: ::core::option::Option<create_scene_header::Cameras>,
@@ -898,6 +901,10 @@ pub struct RefineReport {
     /// Photos that were learnt beside those of the scene: the networks did not see them.
     #[prost(uint32, tag = "10")]
     pub more_photos: u32,
+    /// Share of each photo that took no part, in the order of the cameras: it shows what the other
+    /// photos do not. None where nothing is left out for that.
+    #[prost(double, repeated, tag = "11")]
+    pub transient: ::prost::alloc::vec::Vec<f64>,
 }
 /// How far a camera is from where it was given.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]

@@ -30,16 +30,17 @@ use crate::{
     limits::Limits,
     names::named,
     pipeline::{
-        self, PhotoSet, Pipeline, ReadSet, Seen, cameras, make_for_refinement,
+        self, PhotoSet, Pipeline, ReadSet, Seen, cameras, ignored, make_for_refinement,
         refinement::{RefineCalls, refined, reported, spooled, version_of},
         semantics::{SemanticsInput, understand},
     },
     refine::{RefineOptions, RefinedVersion},
     scene::{
-        CamerasMode, Density, PhotoHash, Preset, Provenance, Refine, RefineReport, Scene, SceneId,
-        SceneMeta, SceneOptions, SemanticsMode, Stage, Upload, Watch, unless_cancelled,
+        CamerasMode, Density, PhotoHash, PosedPhoto, Preset, Provenance, Refine, RefineReport,
+        Scene, SceneId, SceneMeta, SceneOptions, SemanticsMode, Stage, Upload, Watch,
+        unless_cancelled,
     },
-    service::{check_refine, scene_splats},
+    service::{check_refine, checked_words, scene_splats},
     store::{self, write_scene_file, write_semantics_file},
 };
 
@@ -66,6 +67,9 @@ pub(super) struct Args {
     /// 60 s where there are five photos and more
     #[arg(long, value_name = "off|auto|MILLISECONDS", default_value = "off")]
     refine: Refine,
+    /// Leave what this word names out of the scene, as `person`; may be given several times
+    #[arg(long, value_name = "WORD")]
+    ignore: Vec<String>,
     /// Gaussians kept: `thinned`, one for up to 16 neighbours where the photos are flat, or `full`
     #[arg(long, value_parser = named::<Density>)]
     density: Option<Density>,
@@ -87,6 +91,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         preset: args.preset,
         density: args.density,
         refine: Some(args.refine),
+        ignore: checked_words(&args.ignore, &config.limits)?,
         ..SceneOptions::default()
     };
     let options = options.with(&args.method)?;
@@ -98,8 +103,12 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     }
     let engine = Pipeline::open(&config.networks())?;
     let eager = args.semantics == SemanticsMode::Eager;
-    if let (true, Some(lack)) = (eager, engine.bundle().lacks_semantics()) {
-        let message = format!("--semantics eager: the bundle has {lack}");
+    let needs = match eager {
+        true => Some("--semantics eager"),
+        false => (!options.ignore.is_empty()).then_some("--ignore"),
+    };
+    if let (Some(what), Some(lack)) = (needs, engine.bundle().lacks_semantics()) {
+        let message = format!("{what}: the bundle has {lack}");
         return Err(Error::new(ErrorCode::ModelUnavailable, message));
     }
     let begun = Instant::now();
@@ -112,6 +121,8 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         ReadSet::Posed(photos) => photos,
         ReadSet::Unposed(photos) => cameras::posed(&engine, photos, watch)?,
     };
+    let method = options.method();
+    let photos = ignored::without_words(&engine, photos, &options.ignore, &method, watch)?;
     let refiner = match args.refine {
         Refine::Off => None,
         _ => {
@@ -202,8 +213,12 @@ fn refine(
         if !photos.has_more() {
             return Ok(None);
         }
-        let mut pace = || unless_cancelled(watch.cancel);
-        spooled(upload, options.cameras, side, limits, None, &mut pace).map(Some)
+        let mut ready = |photo: &mut PosedPhoto| {
+            unless_cancelled(watch.cancel)?;
+            let (words, one) = (&options.ignore, std::slice::from_mut(photo));
+            ignored::leave_out_words(engine, one, words, &options.method(), silent).map(drop)
+        };
+        spooled(upload, options.cameras, side, limits, None, &mut ready).map(Some)
     };
     let mut pace = |spent: f32| {
         (watch.progress)(Stage::Refine, spent);

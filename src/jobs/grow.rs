@@ -98,7 +98,7 @@ impl ReadUpload {
         }
     }
 
-    fn with_photos(&self, photos: PhotoSet) -> Self {
+    pub(super) fn with_photos(&self, photos: PhotoSet) -> Self {
         Self { files: self.files.clone(), content: Content::Photos(photos) }
     }
 }
@@ -373,7 +373,13 @@ impl Jobs {
     ) -> Result<(PhotoSet, Vec<PhotoHash>)> {
         let upload = self.parts.store.added(id, &added.object)?;
         let limits = limits_beside(&self.parts.limits.get(), added.files.len(), others);
-        read_joining(&upload, &limits, watch.cancel)
+        let (photos, hashes) = read_joining(&upload, &limits, watch.cancel)?;
+        let options = self.record(id)?.options.clone();
+        if options.ignore.is_empty() {
+            return Ok((photos, hashes));
+        }
+        let (words, method) = (&options.ignore, options.method());
+        Ok((self.parts.semantics.without_words(photos, words, &method, watch)?, hashes))
     }
 
     /// What a scene was made of, with what joined it later and without what left it: the photos of

@@ -8,6 +8,7 @@ use crate::{
     pipeline::{
         self, PhotoSet, Pipeline, PipelineLoader, Reconstruction, Seen, UnposedSet,
         growth::{self, Grown},
+        ignored,
         semantics::{LabelledPhotos, SemanticsInput, label_more},
         words,
     },
@@ -228,6 +229,20 @@ pub trait SemanticNetworks: Send + Sync {
         Err(Error::internal("no network masks texts"))
     }
 
+    /// Photos without what these words name, where they are not yet. On the calling thread.
+    ///
+    /// # Errors
+    /// `model_unavailable`, `invalid_request`, `cancelled`, `internal`.
+    fn without_words(
+        &self,
+        _photos: PhotoSet,
+        _words: &[String],
+        _method: &Method,
+        _watch: Watch<'_>,
+    ) -> Result<PhotoSet> {
+        Err(Error::internal("no network finds words in photos"))
+    }
+
     /// Whether the semantics of a scene are best begun before the scene is made: they need its
     /// Gaussians only at the end, and do not take the processor from the job that makes it.
     fn begin_early(&self, _: &Method) -> bool {
@@ -432,6 +447,16 @@ impl SemanticNetworks for PipelineNetworks {
         let (cameras, gaussians) = (&scene.meta.cameras[..], &scene.gaussians);
         let input = SemanticsInput { photos, cameras, gaussians };
         words::find_words(self.0.get()?, &input, texts, cancel)
+    }
+
+    fn without_words(
+        &self,
+        photos: PhotoSet,
+        words: &[String],
+        method: &Method,
+        watch: Watch<'_>,
+    ) -> Result<PhotoSet> {
+        ignored::without_words(self.0.get()?, photos, words, method, watch)
     }
 
     fn begin_early(&self, method: &Method) -> bool {

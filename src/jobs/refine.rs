@@ -31,8 +31,8 @@ use crate::{
     },
     refine::{RefineBudget, RefineOptions, RefinedVersion},
     scene::{
-        Refine, RefineReport, RefineState, RefineStatus, Scene, SceneError, SceneId, SceneStatus,
-        Stage, Watch, unless_cancelled,
+        PosedPhoto, Refine, RefineReport, RefineState, RefineStatus, Scene, SceneError, SceneId,
+        SceneStatus, Stage, Watch, unless_cancelled,
     },
     store::{Record, RefineOrder},
 };
@@ -208,7 +208,19 @@ impl Jobs {
             }
             let (upload, limits) = (self.parts.store.upload(id)?, self.parts.limits.get());
             let (dir, mode) = (self.parts.store.folder(), record.options.cameras);
-            spooled(&upload, mode, side, &limits, dir, &mut || turns.give_way()).map(Some)
+            let method = record.options.method();
+            let mut ready = |photo: &mut PosedPhoto| {
+                turns.give_way()?;
+                if record.options.ignore.is_empty() {
+                    return Ok(());
+                }
+                let one = PhotoSet::given(vec![photo.clone()], Vec::new(), 0.0);
+                let words = &record.options.ignore;
+                let one = self.parts.semantics.without_words(one, words, &method, watch)?;
+                one.photos.into_iter().for_each(|one| *photo = one);
+                Ok(())
+            };
+            spooled(&upload, mode, side, &limits, dir, &mut ready).map(Some)
         };
         let mut told = 0.0;
         let mut pace = |spent: f32| {

@@ -219,7 +219,8 @@ impl Jobs {
             Content::Unposed(photos) => Content::Photos(self.parts.scenes.pose(photos, watch)?),
             other => other,
         };
-        Ok(Arc::new(ReadUpload { files, content }))
+        let upload = Arc::new(ReadUpload { files, content });
+        self.without_words(upload, &self.record(id)?.options, watch)
     }
 
     /// Keeps a scene with the semantics that it has, and its record.

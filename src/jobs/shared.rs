@@ -19,7 +19,7 @@ use super::{
     job::{Job, Reason, Running},
     kind::{JobKind, Kind},
     networks::{NetworkState, SceneNetworks, SemanticNetworks},
-    photos::{ReadUpload, ReadUploads},
+    photos::{Content, ReadUpload, ReadUploads},
     queue::{Full, Queue},
     records::Records,
     refiner::Refiner,
@@ -29,7 +29,7 @@ use crate::{
     error::{Error, ErrorCode, Result},
     limits::LiveLimits,
     render::Renderer,
-    scene::{Refine, SceneId, SemanticsMode, SemanticsState, Stage, Watch},
+    scene::{Refine, SceneId, SceneOptions, SemanticsMode, SemanticsState, Stage, Watch},
     store::{Record, Store, not_found},
 };
 
@@ -272,12 +272,30 @@ impl Jobs {
     pub(super) fn upload(&self, id: &SceneId, watch: Watch<'_>) -> Result<Arc<ReadUpload>> {
         let record = self.record(id)?;
         if let Some(kept) = self.uploads.find(id).filter(|kept| kept.fits(&record.status)) {
-            return Ok(kept);
+            return self.without_words(kept, &record.options, watch);
         }
         let upload = self.parts.store.upload(id)?;
         let limits = self.parts.limits.get();
         let read = ReadUpload::of(&upload, &record.options, &limits, watch.cancel)?;
-        self.with_joined(read.of_scene(&record.status), &record, watch).map(Arc::new)
+        let read = Arc::new(read.of_scene(&record.status));
+        let read = Arc::unwrap_or_clone(self.without_words(read, &record.options, watch)?);
+        self.with_joined(read, &record, watch).map(Arc::new)
+    }
+
+    /// An upload whose photos are without what the words of its scene name, once they have cameras.
+    pub(super) fn without_words(
+        &self,
+        upload: Arc<ReadUpload>,
+        options: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<Arc<ReadUpload>> {
+        let Content::Photos(photos) = &upload.content else { return Ok(upload) };
+        if options.ignore.is_empty() || photos.is_without_words {
+            return Ok(upload);
+        }
+        let (photos, method) = (photos.clone(), options.method());
+        let photos = self.parts.semantics.without_words(photos, &options.ignore, &method, watch)?;
+        Ok(Arc::new(upload.with_photos(photos)))
     }
 
     /// Forgets the photos of a finished scene where they are not kept, and no job that may come

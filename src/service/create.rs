@@ -9,6 +9,7 @@ use super::{
     request::CreateScene,
     shared::{KEY_LOCKS, Service, Shared},
     tasks::blocking,
+    texts,
     types::Created,
 };
 use crate::{
@@ -60,6 +61,10 @@ impl Service {
     pub async fn create_scene(&self, request: CreateScene) -> Result<Created> {
         let CreateScene { upload, mut options, idempotency_key, wait, request_id } = request;
         check_request(&options, idempotency_key.as_deref(), &self.limits())?;
+        options.ignore = checked_words(&options.ignore, &self.limits())?;
+        if !options.ignore.is_empty() {
+            self.inner.can_understand("ignore")?;
+        }
         if options.semantics == SemanticsMode::Eager {
             self.inner.can_understand("semantics=eager")?;
         }
@@ -179,6 +184,14 @@ fn check_request(
     options.method().check()?;
     options.refine.map_or(Ok(()), |refine| refine::check_refine(refine, limits))?;
     check_key(key)
+}
+
+/// The words of `ignore`, each checked; there may be none.
+pub(crate) fn checked_words(
+    words: &[String],
+    limits: &crate::limits::Limits,
+) -> Result<Vec<String>> {
+    if words.is_empty() { Ok(Vec::new()) } else { texts::all_checked(words, "ignore", limits) }
 }
 
 /// Refuses an idempotency key that is empty or too long.

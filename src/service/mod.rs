@@ -33,7 +33,7 @@ mod view;
 mod words;
 mod work;
 
-pub(crate) use self::refine::check_refine;
+pub(crate) use self::{create::checked_words, refine::check_refine};
 pub use self::{
     edits::{EditBox, EditOp, EditPick, EditSelection, EditSpec, EditSphere, SceneEdits},
     export::scene_splats,

@@ -432,6 +432,10 @@ async fn what_the_bundle_cannot_do_is_refused_by_name() {
         let fault = door.create(&upload(), &options).await.unwrap_err();
         assert_eq!(fault.code, "model_unavailable", "{}", fault.message);
         assert!(fault.message.contains("\"plane\""), "{} names no bundle", fault.message);
+        let options = Options { ignore: vec!["person"], ..Options::wait() };
+        let fault = door.create(&upload(), &options).await.unwrap_err();
+        assert_eq!(fault.code, "model_unavailable", "{}", fault.message);
+        assert!(fault.message.starts_with("ignore"), "{}", fault.message);
         let options = Options { bundle: Some("other"), ..Options::wait() };
         let fault = door.create(&upload(), &options).await.unwrap_err();
         assert!(fault.message.contains("\"other\""), "{}", fault.message);

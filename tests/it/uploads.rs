@@ -1,10 +1,14 @@
 //! Uploads over HTTP that are refused while they are read; messages name the bound.
 
+use std::sync::Arc;
+
 use reqwest::multipart::{Form, Part};
+use segsplat::service::QuerySpec;
 
 use crate::common::{
-    doors::{Fault, bytes},
-    server::TestServer,
+    doors::{Fault, Options, both, bytes},
+    meaning::PhotoMeaning,
+    server::{PATIENCE, TestServer, upload},
 };
 
 async fn refused(server: &TestServer, form: Form) -> Fault {
@@ -80,4 +84,37 @@ async fn an_upload_that_cannot_be_a_scene_says_what_is_missing() {
         assert_eq!(fault.code, "invalid_request", "{fault:?}");
         assert!(fault.message.contains(word), "{fault:?} lacks {word}");
     }
+}
+
+#[tokio::test]
+async fn what_words_name_is_left_out_of_a_scene_over_both_doors() {
+    let meaning = Arc::new(PhotoMeaning::default());
+    let given = Arc::clone(&meaning);
+    let server = TestServer::with(|_, parts| parts.semantics = given).await;
+    for door in both(server.addr).await {
+        let gaussians = async |ignore: Vec<&'static str>| {
+            let options = Options { ignore, ..Options::wait() };
+            let (id, state) = door.create(&upload(), &options).await.expect("a good upload");
+            assert_eq!(state, "done", "{}", door.name());
+            let status = server.service.get(&id.parse().unwrap()).await.unwrap();
+            (id, status.report.unwrap().gaussians)
+        };
+        let (_, all) = gaussians(Vec::new()).await;
+        let (id, rest) = gaussians(vec!["person", " dog "]).await;
+        assert_eq!(2 * rest, all, "the stand-in finds each word in half of a photo");
+        // The semantics are those of the photos without it.
+        server.service.query(&id.parse().unwrap(), spec()).await.expect("texts are answered");
+        for (words, why) in [(vec![""; 1], "ignore[0] is empty"), (vec!["a"; 129], "128")] {
+            let options = Options { ignore: words, ..Options::wait() };
+            let fault = door.create(&upload(), &options).await.unwrap_err();
+            assert!(fault.message.contains("ignore"), "{fault:?}");
+            assert!(fault.message.contains(why), "{fault:?} lacks {why}");
+        }
+    }
+    // The second door's scene has the content of the first one's.
+    assert_eq!(*meaning.ignored.lock().unwrap(), [["person", "dog"]], "once for all");
+}
+
+fn spec() -> QuerySpec {
+    QuerySpec { texts: vec!["photo 0".to_owned()], wait: Some(PATIENCE), ..QuerySpec::default() }
 }

@@ -6,6 +6,7 @@
 //! for each thing, which are cut out as the product cuts them.
 
 pub mod npz;
+pub(crate) mod paste;
 pub mod segments;
 
 use std::{

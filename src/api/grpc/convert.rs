@@ -138,7 +138,7 @@ fn refine_report(report: RefineReport) -> pb::RefineReport {
     message!(RefineReport from report
         {
             steps, seconds, held_out, psnr_before, psnr_after, gaussians_before, gaussians_after,
-            left_out, more_photos
+            left_out, more_photos, transient
         }
         cameras: report.cameras.into_iter().map(moved).collect(),
     )
@@ -283,6 +283,7 @@ pub(super) fn scene_options(header: &pb::CreateSceneHeader) -> Result<SceneOptio
                 cameras: value("cameras_mode", header.cameras_mode)?,
                 semantics: value("semantics", header.semantics)?,
                 refine: refine(&header.refine)?,
+                ignore: header.ignore.clone(),
                 preset: value("preset", method.preset)?,
                 density: given("density", method.density)?,
                 mask_level: given("mask_level", method.mask_level)?,

@@ -122,7 +122,9 @@ pub(super) async fn read_upload(
              as application/zip or application/x-tar",
         )),
         (_, Err(full), _) => Err(full),
-        (_, Ok(()), Ok(Sent::Form(mut form))) => parts(upload, &mut form, fields, &body).await,
+        (_, Ok(()), Ok(Sent::Form(mut form))) => {
+            parts(upload, &mut form, fields, limits.texts_max, &body).await
+        }
         (_, Ok(()), Ok(Sent::Archive(whole))) => archive(upload, whole, &body).await,
     };
     let read = read.map_err(|error| body.too_long().unwrap_or(error));
@@ -168,10 +170,12 @@ async fn parts(
     mut upload: UploadBuilder<'_>,
     form: &mut Multipart,
     fields: &mut Fields,
+    words_max: usize,
     body: &WatchedBody,
 ) -> Result<(Upload, UploadGuard)> {
     let all = OPTIONS.concat();
     let mut options = all.clone();
+    let mut words = 0;
     loop {
         let Some(mut field) = form.next_field().await.map_err(broken)? else { break };
         body.progressed();
@@ -195,6 +199,13 @@ async fn parts(
             }
             "archive" => upload.begin_archive(),
             "splats" => upload.begin_splats(field.file_name().unwrap_or_default())?,
+            // More than a call may have say so by their number.
+            "ignore" if words <= words_max => {
+                words += 1;
+                fields.push("ignore", text(&mut field).await?);
+                body.progressed();
+                continue;
+            }
             option if all.contains(&option) => {
                 // Each once, or options alone could fill the memory.
                 let Some(at) = options.iter().position(|left| *left == option) else {

@@ -202,6 +202,7 @@ fn bounds(limits: &Limits) -> Value {
         "text": text,
         "texts": some(&text, limits.texts_max),
         "label": list(&text, limits.texts_max),
+        "ignore": list(&text, limits.texts_max),
         "canon": list(&text, CANON_MAX),
         "tau": range(TAU_RANGE),
         "cut": range([0.0, 1.0]), "coverage_floor": range([0.0, 1.0]),

@@ -239,7 +239,8 @@ fn sse_event(event: &Event) -> sse::Event {
 }
 
 fn options(api: &Api, mut fields: Fields) -> Result<(SceneOptions, Option<Duration>)> {
-    let options: SceneOptions = fields.take()?;
+    let ignore = fields.all("ignore")?;
+    let options = SceneOptions { ignore, ..fields.take()? };
     let CreateParams { bundle, wait_ms } = fields.take()?;
     fields.finish()?;
     check_bundle(&bundle.unwrap_or_default(), api.service.bundle())?;

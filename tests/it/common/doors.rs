@@ -223,6 +223,7 @@ pub(crate) struct Options {
     pub(crate) semantics: Option<&'static str>,
     pub(crate) bundle: Option<&'static str>,
     pub(crate) preset: Option<&'static str>,
+    pub(crate) ignore: Vec<&'static str>,
     pub(crate) idempotency_key: Option<String>,
 }
 
@@ -262,7 +263,9 @@ impl Door {
                 query.extend(options.bundle.map(|s| ("bundle", s.to_owned())));
                 query.extend(options.preset.map(|s| ("preset", s.to_owned())));
                 let url = url(base, "/v1/scenes", &query);
-                let mut request = client.post(url).multipart(form(upload));
+                let words = options.ignore.iter();
+                let form = words.fold(form(upload), |form, word| form.text("ignore", *word));
+                let mut request = client.post(url).multipart(form);
                 if let Some(key) = &options.idempotency_key {
                     request = request.header("idempotency-key", key);
                 }
@@ -603,6 +606,7 @@ pub(crate) fn messages(upload: &Upload, options: &Options) -> Vec<pb::CreateScen
         cameras_mode: pb::CamerasMode::Unspecified.into(),
         wait_ms: options.wait_ms,
         idempotency_key: options.idempotency_key.clone().unwrap_or_default(),
+        ignore: options.ignore.iter().map(|word| (*word).to_owned()).collect(),
     };
     let mut parts = vec![Part::Header(header)];
     for photo in &upload.photos {

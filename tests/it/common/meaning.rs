@@ -15,6 +15,7 @@ use std::{
 use segsplat::{
     error::{Error, ErrorCode, Result},
     jobs::{Phrases, SemanticNetworks},
+    pipeline::PhotoSet,
     scene::{
         Bank, IndexMap, Method, PosedPhoto, Scene, Semantics, SemanticsReport, Stage,
         TextEmbedding, Watch,
@@ -41,6 +42,8 @@ pub(crate) struct PhotoMeaning {
     pub(crate) calls: AtomicUsize,
     /// Pixels of the photos of the last call, one photo after the other.
     pub(crate) pixels: std::sync::Mutex<Vec<u8>>,
+    /// Words that photos were to be without, each time.
+    pub(crate) ignored: std::sync::Mutex<Vec<Vec<String>>>,
     /// Texts embedded, from the begin of their call on.
     pub(crate) embedded: AtomicUsize,
     /// The text tower is held back while true.
@@ -89,6 +92,23 @@ impl SemanticNetworks for PhotoMeaning {
             TextEmbedding { row, tokens: 1, unknown, cut: false }
         };
         Ok(texts.iter().map(embed).collect())
+    }
+
+    /// A thing of any word is the left half of each photo.
+    fn without_words(
+        &self,
+        mut photos: PhotoSet,
+        words: &[String],
+        _: &Method,
+        _: Watch<'_>,
+    ) -> Result<PhotoSet> {
+        if !photos.is_without_words {
+            self.ignored.lock().expect("no panic holds it").push(words.to_vec());
+            let left = IndexMap { width: 2, height: 1, index: vec![1, 0] };
+            photos.photos.iter_mut().for_each(|posed| posed.photo.leave_out(&left));
+            photos.is_without_words = true;
+        }
+        Ok(photos)
     }
 
     fn begin_early(&self, _: &Method) -> bool {

@@ -238,7 +238,11 @@ fn wall(photos: &[PosedPhoto]) -> RawGaussians {
             for x in (0..lens.width).step_by(2) {
                 let at = lens.unproject(f64::from(x) + 1.0, f64::from(y) + 1.0, WALL_DEPTH);
                 let mean = to_world.transform_point3(at) - raw.origin;
-                let pixel = (y * lens.width + x) as usize * 3;
+                let pixel = (y * lens.width + x) as usize;
+                if posed.photo.valid.as_ref().is_some_and(|valid| !valid[pixel]) {
+                    continue;
+                }
+                let pixel = pixel * 3;
                 let rgb = &posed.photo.rgb[pixel..pixel + 3];
                 let colour = [0, 1, 2].map(|c| (f32::from(rgb[c]) / 255.0 - 0.5) / 0.282_094_8);
                 raw.means.push(mean.as_vec3().to_array());

@@ -120,10 +120,13 @@ def create(
     """Uploads photos. A second try never makes a second scene: both carry one key."""
     if not policy.limits:
         yield from meet(policy)
+    params = {name.removesuffix("_"): value for name, value in options.items()}
+    if isinstance(words := params.get("ignore"), str):
+        params["ignore"] = [words]
     request = Request(
         "POST",
         "/v1/scenes",
-        params={name.removesuffix("_"): value for name, value in options.items()},
+        params=params,
         upload=parts_of(source, policy.limits, options.get("cameras") == "solve")
         + masks_in(masks),
         headers={"idempotency-key": idempotency_key or str(uuid4())},

@@ -236,6 +236,9 @@ class SceneOptions(TypedDict, total=False):
     #: Whether the finished scene is refined: "auto", "off" or milliseconds; as the server is set by
     #: default.
     refine: str | int
+    #: Words whose things take no part in the scene, as "person": what is found of them in the
+    #: photos is left out, as by a mask.
+    ignore: str | Sequence[str]
     #: "full" keeps one Gaussian a pixel, "thinned" fewer where photos are flat.
     density: Literal["thinned", "full"]
     #: Whether Gaussians that add nothing are dropped.
@@ -350,6 +353,9 @@ class RefineReport:
     left_out: tuple[str, ...] = ()
     #: Photos that were learnt beside those of the scene: the networks did not see them.
     more_photos: int = 0
+    #: Share of each photo that took no part, for it shows what the others do not; empty where
+    #: nothing is left out for that.
+    transient: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -125,6 +125,10 @@ macro_rules! method {
             #[serde(skip_serializing_if = "Option::is_none")]
             #[param(value_type = Option<String>)]
             pub refine: Option<Refine>,
+            /// Words whose things take no part in the scene, as `person`; may be given several
+            /// times. What is found of them in the photos is left out, as by a mask.
+            #[serde(skip_serializing_if = "Vec::is_empty")]
+            pub ignore: Vec<String>,
             /// `default`, or `paper`: the method of the paper. The options below change single
             /// fields of it.
             #[param(inline)]
@@ -140,7 +144,8 @@ macro_rules! method {
         impl SceneOptions {
             /// Names of all options.
             pub const NAMES: &[&str] =
-                &["max_views", "cameras", "semantics", "refine", "preset", $(stringify!($name),)+];
+                &["max_views", "cameras", "semantics", "refine", "ignore", "preset",
+                    $(stringify!($name),)+];
 
             /// The method that these options spell.
             pub fn method(&self) -> Method {

@@ -2,7 +2,10 @@
 
 use serde::Deserialize;
 
-use crate::{error::short, scene::Camera};
+use crate::{
+    error::short,
+    scene::{Camera, IndexMap},
+};
 
 /// 8-bit sRGB pixels, row-major, with the pixels that have a source.
 #[derive(Clone, Debug)]
@@ -18,6 +21,21 @@ pub struct Photo {
     /// out. `None` when all take part. Gaussians, steps of refinement and names come from valid
     /// pixels alone.
     pub valid: Option<Vec<bool>>,
+}
+
+impl Photo {
+    /// Pixels where `map` has an entry take no part in the scene from now on.
+    pub fn leave_out(&mut self, map: &IndexMap) {
+        if map.index.iter().all(|entry| *entry == 0) {
+            return;
+        }
+        let (width, height) = (self.width as usize, self.height as usize);
+        let share = |at: usize, side: usize| (at as f64 + 0.5) / side as f64;
+        let valid = self.valid.get_or_insert_with(|| vec![true; width * height]);
+        for (i, valid) in valid.iter_mut().enumerate() {
+            *valid &= map.at(share(i % width, width), share(i / width, height)) == 0;
+        }
+    }
 }
 
 /// A cut of a photo around one thing, black elsewhere: what an image tower is shown.

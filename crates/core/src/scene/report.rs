@@ -42,6 +42,8 @@ pub enum WarningCode {
     PhotosTurned,
     /// Photos with a mask: what it leaves out takes no part in the scene.
     MasksUsed,
+    /// What words name is left out of the photos, or found in none.
+    WordsIgnored,
     /// Photos too large to be decoded whole, which were read at a smaller scale.
     PhotosReduced,
     /// Keys of a camera file that change what its numbers mean and are not read.

@@ -29,6 +29,33 @@ impl IndexMap {
         let at = cell(y, self.height) * self.width as usize + cell(x, self.width);
         self.index.get(at).copied().unwrap_or(0)
     }
+
+    /// Share of the cells that have an entry, 0..1.
+    pub fn share(&self) -> f64 {
+        let some = self.index.iter().filter(|entry| **entry > 0).count();
+        some as f64 / self.index.len().max(1) as f64
+    }
+
+    /// The same, where each cell has the largest entry of those that are at most so many cells
+    /// away along rows and columns.
+    pub fn wider(&self, cells: usize) -> Self {
+        let (width, height) = (self.width as usize, self.height as usize);
+        let window = |at: usize, end: usize| at.saturating_sub(cells)..(at + cells + 1).min(end);
+        let most = |of: &[u16], at: &dyn Fn(usize) -> usize, range: std::ops::Range<usize>| {
+            range.map(|i| of[at(i)]).max().unwrap_or(0)
+        };
+        let all = 0..self.index.len();
+        let along = |i: usize| {
+            let (x, y) = (i % width, i / width);
+            most(&self.index, &|x| y * width + x, window(x, width))
+        };
+        let rows: Vec<u16> = all.clone().map(along).collect();
+        let across = |i: usize| {
+            let (x, y) = (i % width, i / width);
+            most(&rows, &|y| y * width + x, window(y, height))
+        };
+        Self { index: all.map(across).collect(), ..*self }
+    }
 }
 
 /// One mask of a photo, as the mask network saw it.

@@ -101,6 +101,7 @@ fn check_options(format: &SplatFormat, options: &SceneOptions, has_semantics: bo
         SceneOptions { cameras: CamerasMode::Solve, .. } => "cameras",
         SceneOptions { density: Some(_), .. } => "density",
         SceneOptions { refine: Some(Refine::Ms(_)), .. } => "refine",
+        SceneOptions { ignore, .. } if !ignore.is_empty() => "ignore",
         _ if eager => "semantics=eager",
         _ => return Ok(()),
     };
@@ -192,6 +193,7 @@ mod tests {
             (SceneOptions { max_views: Some(2), ..none() }, "max_views"),
             (SceneOptions { density: Some(Density::Full), ..none() }, "density"),
             (SceneOptions { refine: Some(Refine::Ms(5)), ..none() }, "refine"),
+            (SceneOptions { ignore: vec!["person".to_owned()], ..none() }, "ignore"),
             (SceneOptions { semantics: SemanticsMode::Eager, ..none() }, "semantics=eager"),
         ] {
             let refused = read(vec![[0.0; 3]], DVec3::ZERO).into_scene(&options).unwrap_err();

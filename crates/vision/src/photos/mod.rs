@@ -114,7 +114,7 @@ pub fn more(
     side_max: u32,
     limits: &Limits,
     cancel: &AtomicBool,
-    mut put: impl FnMut(&PosedPhoto) -> Result<()>,
+    mut put: impl FnMut(PosedPhoto) -> Result<()>,
 ) -> Result<()> {
     // Those whose cameras are solved have all been seen by networks.
     if find_unposed(upload, mode, limits)?.is_some() {
@@ -133,7 +133,7 @@ pub fn more(
             .collect::<Result<_>>()?;
         for read in some {
             match read {
-                Ok((photo, _)) => put(&photo)?,
+                Ok((photo, _)) => put(photo)?,
                 Err(error) => tracing::warn!(reason = error.message(), "not learnt"),
             }
         }

@@ -124,7 +124,8 @@ pub fn posed(pipeline: &Pipeline, set: UnposedSet, watch: Watch<'_>) -> Result<P
     meter::stage(Stage::Cameras.name(), ms / 1e3);
     (watch.progress)(Stage::Cameras, 1.0);
     let own = StageTime { stage: Stage::Cameras.name().to_owned(), ms };
-    Ok(PhotoSet { photos, warnings, stages: vec![read_time(read_ms), own], cameras })
+    let stages = vec![read_time(read_ms), own];
+    Ok(PhotoSet { photos, warnings, stages, cameras, is_without_words: false })
 }
 
 /// What [`posed`] finds, and whether it would refuse it.

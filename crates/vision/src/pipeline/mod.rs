@@ -7,6 +7,7 @@
 
 pub mod cameras;
 pub mod growth;
+pub mod ignored;
 mod loader;
 pub mod masks;
 mod networks;

@@ -29,7 +29,7 @@ use crate::{
         PhotoMasks, PosedPhoto, Preset, RowViews, SceneCamera, ScoringMethod, Semantics,
         SemanticsReport, Stage, Watch, unless_cancelled,
     },
-    semantics::{self, Clusters, Cutter, Scoring, Tracks, Views},
+    semantics::{self, Clusters, Cutter, Scorer, Scoring, TextScores, Tracks, Views},
 };
 
 /// Crops that take an image tower as long as a whole photo, about.
@@ -365,6 +365,22 @@ impl LabelledPhotos {
         embedded.rows.extend(more.rows);
         embedded.of.extend(more.of.into_iter().map(|[photo, mask]| [before + photo, mask]));
         (self.masks.iter().cloned().chain(masks).collect(), embedded)
+    }
+
+    /// What scores texts by the masks, each of which is a row.
+    pub(super) fn scorer(&self, scoring: Arc<Scoring>) -> Result<Scorer> {
+        Scorer::new(&Bank { dim: self.dim, rows: self.embedded.rows.clone() }, scoring)
+    }
+
+    /// Of each photo the cells of the masks that a text of [`Self::scorer`] selects: 1.
+    pub(super) fn selected(&self, text: &TextScores) -> Vec<IndexMap> {
+        let mut becomes: Vec<Vec<u16>> =
+            self.masks.iter().map(|of| vec![0; of.masks.len()]).collect();
+        for (row, &[photo, mask]) in (1..).zip(&self.embedded.of) {
+            becomes[photo][mask] = text.selects(row).into();
+        }
+        let maps = self.masks.iter().zip(&becomes);
+        maps.map(|(of, becomes)| semantics::relabel(&of.map, becomes)).collect()
     }
 
     /// Gives it to the scene that was made of these photos: the last stage.

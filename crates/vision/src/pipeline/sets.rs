@@ -19,6 +19,8 @@ pub struct PhotoSet {
     pub stages: Vec<StageTime>,
     /// Where the cameras come from.
     pub cameras: CamerasReport,
+    /// Whether they are without what the words of their scene name.
+    pub is_without_words: bool,
 }
 
 impl PhotoSet {
@@ -26,7 +28,8 @@ impl PhotoSet {
     #[must_use]
     pub fn given(photos: Vec<PosedPhoto>, warnings: Vec<Warning>, read_ms: f64) -> Self {
         let stages = vec![read_time(read_ms)];
-        Self { photos, warnings, stages, cameras: CamerasReport::default() }
+        let cameras = CamerasReport::default();
+        Self { photos, warnings, stages, cameras, is_without_words: false }
     }
 
     /// Whether the upload has photos for the steps of a refinement alone.
@@ -57,7 +60,8 @@ impl PhotoSet {
         let of = |file: &str| self.photos.iter().find(|posed| posed.file == file).cloned();
         let photos = files.map(of).collect::<Option<_>>()?;
         let (warnings, stages) = (self.warnings.clone(), self.stages.clone());
-        Some(Self { photos, warnings, stages, cameras: self.cameras.clone() })
+        let cameras = self.cameras.clone();
+        Some(Self { photos, warnings, stages, cameras, is_without_words: self.is_without_words })
     }
 
     /// Whether they are the photos of these cameras, in their order.
@@ -112,6 +116,7 @@ impl UnposedSet {
             posed.push(photos::posed(photos.swap_remove(at), &solved));
         }
         let stages = vec![read_time(read_ms)];
-        PhotoSet { photos: posed, warnings, stages, cameras: report.clone() }
+        let cameras = report.clone();
+        PhotoSet { photos: posed, warnings, stages, cameras, is_without_words: false }
     }
 }

@@ -301,7 +301,7 @@ fn of_too_many_photos_the_best_are_taken_and_named() {
         photos::more(&upload, auto, 24, &limits, &never, |photo| {
             let stem = photo.file.trim_end_matches(".png");
             let number: usize = stem[stem.len() - 4..].parse().unwrap();
-            let [got, want] = [photo, &many[number]].map(|it| it.camera.camera_to_world);
+            let [got, want] = [&photo, &many[number]].map(|it| it.camera.camera_to_world);
             assert!(got.center().distance(want.center()) < 1e-5, "{layout}: {}", photo.file);
             assert!(got.turn_to(&want) < 1e-5, "{layout}: {}", photo.file);
             assert_eq!((photo.photo.width, photo.photo.height), (24, 18), "{layout}");
