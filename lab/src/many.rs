@@ -283,8 +283,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     Ok(())
 }
 
-/// What becomes of a scene when `count` of its photos, spread evenly, join those before: PSNR at the
-/// targets before, after, and of a scene made of all photos at once.
+/// What becomes of a scene when `count` of its photos, spread evenly, join those before: PSNR at
+/// the targets before, after, and of a scene made of all photos at once.
 fn joining(
     engine: &Pipeline,
     renderer: &dyn Renderer,

@@ -18,9 +18,9 @@ use rayon::prelude::*;
 
 use super::{
     bin::{self, Bins, chunk_of},
-    cell::{CELL_X, CELL_Y, CELLS, Numbers, PIXEL_X, PIXEL_Y, PIXELS, Staged, Tile, place},
+    cell::{CELL_X, CELL_Y, CELLS, PIXEL_X, PIXEL_Y, PIXELS, Staged, Tile, place},
     footprint::Footprint,
-    lanes::{KernelOptions, LaneKernel, Lanes, exp2_neg},
+    lanes::{KernelOptions, LaneKernel, Lanes, Numbers, exp2_neg},
     paint::Paint,
     pool::Pool,
     project::Projected,

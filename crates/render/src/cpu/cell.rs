@@ -1,7 +1,7 @@
 //! A tile in work: its cells of pixels, its Gaussians as the blend needs them, and the bins of its
 //! entries.
 
-use super::{bin::value, footprint::Footprint, lanes::Lanes, paint::CHANNELS};
+use super::{bin::value, footprint::Footprint, lanes::Numbers, paint::CHANNELS};
 use crate::constants::{BATCH_SIZE, TILE_SIZE};
 
 /// Place and size of a tile, pixels.
@@ -34,27 +34,6 @@ pub(super) const CELL_Y: Numbers = along(ACROSS, true, CELL as f32);
 /// Centres of a cell's pixels, relative to the centre of the cell.
 pub(super) const PIXEL_X: Numbers = along(CELL, false, 1.0);
 pub(super) const PIXEL_Y: Numbers = along(CELL, true, 1.0);
-/// One number for each of 16 pixels or cells, in one line of the cache.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-#[repr(C, align(64))]
-pub(super) struct Numbers(pub(super) [f32; 16]);
-
-impl Numbers {
-    pub(super) const ZERO: Self = Self([0.0; 16]);
-    const ONE: Self = Self([1.0; 16]);
-
-    /// Vector `i`.
-    #[inline(always)]
-    pub(super) fn at<S: Lanes>(&self, simd: S, i: usize) -> S::f32s {
-        simd.load(&self.0, i)
-    }
-
-    /// Writes vector `i`.
-    #[inline(always)]
-    pub(super) fn put<S: Lanes>(&mut self, simd: S, i: usize, value: S::f32s) {
-        simd.store(&mut self.0, i, value);
-    }
-}
 
 /// Columns (or rows) of a square of `side` x `side`, `step` apart, counted from its middle.
 const fn along(side: usize, rows: bool, step: f32) -> Numbers {

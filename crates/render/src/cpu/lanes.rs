@@ -14,6 +14,28 @@ use pulp::x86::{V3, V4};
 
 use crate::switches::{Skip, Switches, Width};
 
+/// One number for each of 16 pixels or cells, in one line of the cache.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[repr(C, align(64))]
+pub(super) struct Numbers(pub(super) [f32; 16]);
+
+impl Numbers {
+    pub(super) const ZERO: Self = Self([0.0; 16]);
+    pub(super) const ONE: Self = Self([1.0; 16]);
+
+    /// Vector `i`.
+    #[inline(always)]
+    pub(super) fn at<S: Lanes>(&self, simd: S, i: usize) -> S::f32s {
+        simd.load(&self.0, i)
+    }
+
+    /// Writes vector `i`.
+    #[inline(always)]
+    pub(super) fn put<S: Lanes>(&mut self, simd: S, i: usize, value: S::f32s) {
+        simd.store(&mut self.0, i, value);
+    }
+}
+
 /// How the kernels of a frame run. The default: the widest lanes, and no needless work.
 #[derive(Clone, Copy, Debug)]
 pub struct KernelOptions {

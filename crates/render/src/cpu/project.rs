@@ -9,10 +9,9 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::{
-    cell::Numbers,
     cull::Shown,
     footprint::Footprint,
-    lanes::{KernelOptions, LaneKernel, Lanes, Row, Wide, ln},
+    lanes::{KernelOptions, LaneKernel, Lanes, Numbers, Row, Wide, ln},
     tiles::{BLOCK, Ellipses, Grid, TileSpans},
 };
 use crate::{

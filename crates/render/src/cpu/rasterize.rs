@@ -14,11 +14,11 @@
 use super::{
     bin::value,
     cell::{
-        CELL, CELL_X, CELL_Y, CELLS, Cell, GROUP, NO_BIN, Numbers, PIXEL_X, PIXEL_Y, PIXELS,
-        Staged, Tile, TileScratch, place,
+        CELL, CELL_X, CELL_Y, CELLS, Cell, GROUP, NO_BIN, PIXEL_X, PIXEL_Y, PIXELS, Staged, Tile,
+        TileScratch, place,
     },
     footprint::Footprint,
-    lanes::{LaneKernel, Lanes, exp2_neg},
+    lanes::{LaneKernel, Lanes, Numbers, exp2_neg},
     paint::{CHANNELS, Paint},
     store::{PictureRows, Store},
 };

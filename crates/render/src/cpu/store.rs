@@ -5,10 +5,9 @@ use std::ops::Range;
 
 use super::{
     cell::{
-        ACROSS, CELL, CELL_X, CELL_Y, CELLS, Cell, Numbers, PIXEL_X, PIXEL_Y, PIXELS, Tile,
-        TileScratch,
+        ACROSS, CELL, CELL_X, CELL_Y, CELLS, Cell, PIXEL_X, PIXEL_Y, PIXELS, Tile, TileScratch,
     },
-    lanes::{LaneKernel, Lanes},
+    lanes::{LaneKernel, Lanes, Numbers},
     paint::{Behind, Paint},
     sky::Sky,
 };

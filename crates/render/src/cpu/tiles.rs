@@ -49,8 +49,8 @@ impl Grid {
     }
 }
 
-/// The result of [`touched_tiles`] for a footprint of at most two rows of tiles, which most are, and
-/// its depth: all that a pair of a tile and a Gaussian needs, in 16 bytes instead of 64.
+/// The result of [`touched_tiles`] for a footprint of at most two rows of tiles, which most are,
+/// and its depth: all that a pair of a tile and a Gaussian needs, in 16 bytes instead of 64.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TileSpans {
     /// Depth of the footprint.
