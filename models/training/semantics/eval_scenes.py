@@ -9,7 +9,8 @@ Each scene is a folder in the layout of the shared scenes: `images/*.png`, `tran
 them `instances/*.png` (value = object) and `scene.json` (which mesh is which object, where it is, its
 smallest upright box, and which classes are only surroundings: floor and walls are counted as wrong
 where a text selects them, and are not asked for). Odd scenes are a table top, even ones a room with furniture. The same
-seed gives the same bytes of every picture.
+seed gives the same bytes of every picture with the same versions of numpy, pillow and trimesh; others
+may choose other things.
 """
 import argparse
 import ctypes
