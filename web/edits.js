@@ -78,17 +78,9 @@ const redo = () =>
     return { list: future.at(-1), past: [...past, list], future: future.slice(0, -1) };
   });
 
-// Takes the scene as it is now, and asks for the words that are shown again.
 async function showEdited(id) {
   edits.turn += 1;
-  choose(null);
-  versions.forget();
-  await takeScene(id, watching.signal);
-  if (state.scene?.id !== id) return;
-  strip(state.scene);
-  markStop(frames.get(state.camera));
-  list().catch(failed);
-  await askAgain();
+  if (!(await takeChanged(id))) return;
   const last = edits.list.length - 1;
   const what = last < 0 ? t('edits.whole') : said(edits.list[last], edits.counts[last]);
   const share = (100 * edits.uncovered).toFixed(1);

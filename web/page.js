@@ -69,6 +69,8 @@ function bindWays() {
     e.target.value = '';
   };
   $('sample').onclick = () => trySample().catch(failed);
+  $('join').onchange = () => mayJoin(true);
+  $('leave').onclick = askLeaving;
   addEventListener('dragover', (e) => {
     e.preventDefault();
     document.body.classList.add('over');

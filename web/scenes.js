@@ -44,7 +44,7 @@ function row(item) {
   const remove = make('button', {
     type: 'button',
     textContent: '×',
-    onclick: () => askDeletion(id),
+    onclick: () => askDeletion('delete', nameOf(id), () => deleteScene(id)),
   });
   return make('li', {}, button, labelled(remove, t('delete', { name: nameOf(id) })));
 }
@@ -126,15 +126,17 @@ function markStop(photo) {
     button.setAttribute('aria-current', String(i === at));
     if (i === at) button.scrollIntoView({ block: 'nearest', inline: 'nearest' });
   }
+  $('leave').disabled = at < 0;
 }
 
 // ---- deletion ---------------------------------------------------------------------------------
-// The dialog closes with what is chosen; Escape chooses nothing.
-function askDeletion(id) {
-  $('deletion-title').textContent = t('delete.ask', { name: nameOf(id) });
+// The dialog closes with what is chosen; Escape chooses nothing. `what` is how its texts begin.
+function askDeletion(what, name, act) {
+  $('deletion-title').textContent = t(`${what}.ask`, { name });
+  for (const part of ['what', 'ever', 'yes']) $(`deletion-${part}`).textContent = t(`${what}.${part}`);
   $('deletion').returnValue = '';
   $('deletion').onclose = () => {
-    if ($('deletion').returnValue) deleteScene(id).catch(failed);
+    if ($('deletion').returnValue) act().catch(failed);
   };
   $('deletion').showModal();
 }
@@ -153,6 +155,7 @@ function close() {
   for (const work of [watching, loading, state.filming]) work?.abort();
   forget();
   Object.assign(state, { scene: null, camera: null, home: null });
+  mayJoin(false);
   document.body.classList.remove('shown');
   history.replaceState(null, '', location.pathname);
 }
@@ -335,6 +338,20 @@ async function takeScene(id, signal) {
   return true;
 }
 
+// Takes a scene that was changed as it is now, and asks for the words that are shown again. Gives
+// whether it is still the one that is shown.
+async function takeChanged(id) {
+  choose(null);
+  versions.forget();
+  await takeScene(id, watching.signal);
+  if (state.scene?.id !== id) return false;
+  strip(state.scene);
+  markStop(frames.get(state.camera));
+  list().catch(failed);
+  await askAgain();
+  return true;
+}
+
 // How many Gaussians there are, and which of them where the device has no room for all.
 function shown() {
   const all = state.scene.gaussians;
@@ -346,6 +363,7 @@ function shown() {
 function about(scene) {
   const { report } = scene;
   $('name').placeholder = titleOf(scene);
+  mayJoin(!report.file_format);
   const times = report.stages
     .map(({ stage, ms }) => `${stage} ${(ms / 1000).toFixed(1)} s`)
     .join(', ');

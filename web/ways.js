@@ -36,11 +36,19 @@ async function upload(files) {
     return;
   }
   say(t('sending'));
+  const sent = (share) => step.at('sending', share);
   try {
-    const answer = await server.send('/v1/scenes', capture.form, (share) =>
-      step.at('sending', share),
-    );
-    made = answer.id;
+    if ($('join').checked) {
+      const { id } = state.scene,
+        photos = `/v1/scenes/${encodeURIComponent(id)}/photos`;
+      made = id;
+      await followChange(await server.send(photos, capture.form, sent));
+      return;
+    }
+    for (const word of $('ignore').value.split(',')) {
+      if (word.trim()) capture.form.append('ignore', word.trim());
+    }
+    made = (await server.send('/v1/scenes', capture.form, sent)).id;
     if (!names.of(made)) names.give(made, nameFrom(files));
     await list();
     await open(made);
@@ -49,6 +57,48 @@ async function upload(files) {
     blame(error.message);
     failed(error);
   }
+}
+
+// Whether what comes next may join the scene that is shown: one of photos.
+function mayJoin(may) {
+  $('join-row').hidden = !may;
+  if (!may) $('join').checked = false;
+  $('ignore-row').hidden = $('join').checked;
+}
+
+// Asks, then takes the photo that is looked through out of the scene.
+function askLeaving() {
+  const { id } = state.scene,
+    { file } = frames.get(state.camera);
+  const path = `/v1/scenes/${encodeURIComponent(id)}/photos/${encodeURIComponent(file)}`;
+  askDeletion('leave', file, async () =>
+    followChange(await server.json(path, { method: 'DELETE' })),
+  );
+}
+
+// Waits until the scene is served with the photos that it has now, and shows it: the camera, the
+// words and the edits stay. `told` is what the server answered to the change.
+async function followChange(told) {
+  const { id } = told,
+    { signal } = watching,
+    path = `/v1/scenes/${encodeURIComponent(id)}`,
+    before = state.scene.cameras.length;
+  while (told.growth.state === 'running') {
+    const { stage, fraction } = told.growth;
+    step.at('changing', fraction);
+    if (stage) say(`${t(`stage.${stage}`)}: ${Math.round(100 * fraction)} %`);
+    await new Promise((resolve) => setTimeout(resolve, 300));
+    told = await server.json(path, { signal });
+  }
+  step.end();
+  if (told.growth.error) throw new Error(told.growth.error.message);
+  state.version = told.version;
+  if (!(await takeChanged(id))) return;
+  about(told);
+  await readEdits(id);
+  const n = Math.abs(state.scene.cameras.length - before),
+    key = state.scene.cameras.length < before ? 'left.photos' : 'joined';
+  say(t(key, { n, shown: shown() }));
 }
 
 // A name by what was dropped: its folder, or the one file. Photos alone tell none.

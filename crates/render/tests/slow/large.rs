@@ -26,6 +26,27 @@ fn pictures_of_131072_gaussians_are_the_same() {
     }
 }
 
+/// Scratch of more than two million Gaussians is kept for the scene that it was for. What lies in
+/// it from other views and scenes is in no picture.
+#[test]
+fn kept_scratch_of_large_scenes_is_in_no_other_picture() {
+    let kept = cpu();
+    let scene = |side, seed| {
+        let (gaussians, mut camera) = two_views(side, seed);
+        camera.intrinsics = camera.intrinsics.resized(96, 96);
+        (gaussians, request(camera))
+    };
+    let (large, small, larger) = (scene(1_030, 1), scene(64, 2), scene(1_060, 3));
+    assert!(large.0.len() > 2 << 20, "{} Gaussians lie in small scratch", large.0.len());
+    for (name, (gaussians, request)) in
+        [("large", &large), ("small", &small), ("larger", &larger), ("large again", &large)]
+    {
+        let fresh = cpu().render(gaussians, request).expect("a picture");
+        let frame = kept.render(gaussians, request).expect("a picture");
+        assert!(frame == fresh, "{name}: another picture than that of a new renderer");
+    }
+}
+
 /// Lists far longer than what a workgroup sorts at once, in more pairs than other sorts were found
 /// to lose: long form, on hardware (`RUN_SLOW_TESTS=1`).
 #[test]
