@@ -133,7 +133,8 @@ function markStop(photo) {
 // The dialog closes with what is chosen; Escape chooses nothing. `what` is how its texts begin.
 function askDeletion(what, name, act) {
   $('deletion-title').textContent = t(`${what}.ask`, { name });
-  for (const part of ['what', 'ever', 'yes']) $(`deletion-${part}`).textContent = t(`${what}.${part}`);
+  for (const part of ['what', 'ever', 'yes'])
+    $(`deletion-${part}`).textContent = t(`${what}.${part}`);
   $('deletion').returnValue = '';
   $('deletion').onclose = () => {
     if ($('deletion').returnValue) act().catch(failed);
