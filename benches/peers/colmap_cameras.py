@@ -1,12 +1,12 @@
-"""COLMAP on photos whose cameras are hidden, beside `segsplat-lab cameras` and `segsplat-lab rendered`.
+"""COLMAP on photos whose cameras are hidden, beside `segsplat-lab cameras` and `rendered`.
 
     python colmap_cameras.py SCENES OUT.jsonl --photos 8 [--neighbours] [--scenes fox,terrace]
 
 SCENES is a folder of folders with a `transforms.json`. Of each the same photos are taken as the
 laboratory takes: PHOTOS spread evenly over the capture, or as many that follow each other from its
 middle; 0 are all. SIFT, exhaustive matching and the incremental mapper of pycolmap with their
-defaults, but that all photos have one camera, as ours have (`--mode AUTO`: a camera each). Of several
-models the one with most photos counts. OUT takes a row a scene, with the errors that the
+defaults, but that all photos have one camera, as ours have (`--mode AUTO`: a camera each). Of
+several models the one with most photos counts. OUT takes a row a scene, with the errors that the
 laboratory's rows have: rotations after the one turn of the world that makes the median error least,
 centres after scale and shift, as a share of the longest way between two true ones. Needs pycolmap
 and numpy."""
@@ -51,7 +51,8 @@ def taken(count):
 
 def angle_deg(turn):
     """Angle of a rotation."""
-    sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    skew = turn - turn.T
+    sine = np.linalg.norm([skew[2, 1], skew[0, 2], skew[1, 0]])
     return float(np.degrees(np.arctan2(sine, np.trace(turn) - 1)))
 
 
@@ -67,7 +68,8 @@ def mean_turn(turns):
 def errors(truth, solved):
     """Median and largest error of rotations, degrees, and of centres, a share."""
     if len(solved) < 2:
-        return {"rotation_deg": None, "rotation_worst_deg": None, "position": None, "position_worst": None}
+        names = ("rotation_deg", "rotation_worst_deg", "position", "position_worst")
+        return dict.fromkeys(names)
     names = sorted(solved)
     world = mean_turn([truth[name][0] @ solved[name][0].T for name in names])
     turned = np.sort([angle_deg(truth[n][0] @ (world @ solved[n][0]).T) for n in names])
@@ -165,12 +167,13 @@ def main():
         if row is None:
             print(f"{folder.name}: fewer than {args.photos} photos", flush=True)
             continue
-        told = {"table": "colmap-cameras", "machine": args.machine, "pycolmap": pycolmap.__version__}
-        row = {**told, "mode": args.mode, "seed": args.seed, "threads": args.threads, **row}
+        told = {"table": "colmap-cameras", "machine": args.machine}
+        told |= {"pycolmap": pycolmap.__version__, "mode": args.mode}
+        row = {**told, "seed": args.seed, "threads": args.threads, **row}
         with args.out.open("a") as out:
             out.write(json.dumps(row) + "\n")
-        print(json.dumps({k: row[k] for k in ("scene", "placed", "expected", "rotation_deg", "position",
-                                              "focal", "foreign_placed", "seconds")}), flush=True)
+        shown = ("scene", "placed", "expected", "rotation_deg", "position", "focal", "seconds")
+        print(json.dumps({name: row[name] for name in shown}), flush=True)
 
 
 main()

@@ -16,7 +16,7 @@ use crate::{
 };
 
 /// Median rotation error, degrees, up to which a solution is right.
-const RIGHT_DEG: f64 = 5.0;
+pub(super) const RIGHT_DEG: f64 = 5.0;
 
 /// What the stage found.
 pub(super) struct Solved {

@@ -8,7 +8,7 @@ use serde_json::json;
 use super::{
     captures::{CAPTURES, Exif, Rendered},
     compared::number,
-    hidden::Solved,
+    hidden::{RIGHT_DEG, Solved},
 };
 use crate::{
     error::{Error, Result},
@@ -111,8 +111,8 @@ fn measure(
     tally.within += usize::from(within);
     tally.within_median += usize::from(within_median);
     tally.refused += usize::from(!accepted);
-    // Cameras that users get although they are wrong, or of a photo that is none of the place's.
-    let is_wrong = outcome == "wrong" || (accepted && named == Some(false));
+    // A camera that users get although it is wrong, or of a photo that is none of the place's.
+    let is_wrong = accepted && (turned.worst > RIGHT_DEG || named == Some(false));
     tally.wrong += usize::from(is_wrong);
     if let Some(named) = named {
         tally.foreign[0] += usize::from(named);
