@@ -42,7 +42,7 @@ pub(crate) struct Args {
 }
 
 /// How many captures meet each bar.
-#[derive(Debug, Default)]
+#[derive(Default)]
 struct Tally {
     captures: usize,
     /// All photos of the place placed and accepted, no other one.
@@ -52,7 +52,9 @@ struct Tally {
     within_median: usize,
     refused: usize,
     wrong: usize,
+    /// Photos of another place that were left out, of how many.
     foreign: [usize; 2],
+    /// Accepted solutions without EXIF whose focal length is within the bar, of how many.
     focal: [usize; 2],
 }
 
@@ -82,7 +84,13 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             measure(engine, &capture, &mut tally, rows)?;
         }
     }
-    progress(&format!("{tally:?}"));
+    let Tally { captures, placed, within, within_median, refused, wrong, foreign, focal } = tally;
+    progress(&format!(
+        "{captures} captures: {placed} whole, {within} within the bars ({within_median} by the \
+         median camera), {refused} refused, {wrong} wrong and accepted; another place left out in \
+         {} of {}, focal length without EXIF within 3 % in {} of {}",
+        foreign[0], foreign[1], focal[0], focal[1]
+    ));
     Ok(())
 }
 
