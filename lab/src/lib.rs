@@ -60,6 +60,8 @@ enum Command {
     Many(many::Args),
     /// Hide the cameras of captures, solve them, and compare them
     Cameras(cameras::Args),
+    /// Solve the cameras of rendered captures, and compare them with the true ones
+    Rendered(cameras::rendered::Args),
     /// Compare thinned scenes with scenes of all Gaussians
     Density(setup::Inputs),
     /// Compare views that show scenes smaller than their photos with those of their own size
@@ -123,6 +125,7 @@ pub fn run(cli: &Cli) -> Result<Vec<serde_json::Value>> {
         Command::Photos(args) => photos::run(args, &mut rows)?,
         Command::Many(args) => many::run(args, &mut rows)?,
         Command::Cameras(args) => cameras::run(args, &mut rows)?,
+        Command::Rendered(args) => cameras::rendered::run(args, &mut rows)?,
         Command::Density(args) => density::run(args, &mut rows)?,
         Command::Afar(inputs) => pairs::afar(inputs, &mut rows)?,
         Command::Exports(inputs) => pairs::exports(inputs, &mut rows)?,

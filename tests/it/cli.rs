@@ -298,13 +298,16 @@ fn a_video_becomes_photos_where_ffmpeg_is_there() {
     let (code, said) = asked();
     assert_eq!(code, exit(ErrorCode::InvalidRequest), "{said}");
     assert!(said.contains("Film.MP4: it is a video, and there is no ffmpeg; install"), "{said}");
-    // Stands for the program: three seconds that do not move, then the frames that are asked for.
+    // Stands for the program: three seconds that do not move, then the frames that are asked for,
+    // of which the first is a picture.
+    image::RgbImage::new(32, 32).save(programs.join("0.jpg")).unwrap();
     let program = programs.join("ffmpeg");
     let script = r#"#!/bin/sh
         case "$*" in
         *rawvideo*) /usr/bin/head -c $((320 * 240 * 30)) /dev/zero;;
         *"eq(n\,0)+eq(n\,2)+"*)
-            for i in 0 1 2 3 4 5 6 7 8 9 a b c d e f; do printf '\377\330\377\331'; done;;
+            /bin/cat "${0%/*}/0.jpg"
+            for i in 1 2 3 4 5 6 7 8 9 a b c d e f; do printf '\377\330\377\331'; done;;
         esac
     "#;
     std::fs::write(&program, script).unwrap();
@@ -316,9 +319,9 @@ fn a_video_becomes_photos_where_ffmpeg_is_there() {
             other => break other,
         }
     };
-    // They came as photos, named by their times; pictures they are not.
+    // They came as photos, named by their times; pictures they are not, but for the first.
     assert_eq!(code, exit(ErrorCode::PhotoUnreadable), "{said}");
-    assert!(said.contains("00000.00s.jpg"), "{said}");
+    assert!(said.contains("photo 1 (\"00000.20s.jpg\")"), "{said}");
 }
 
 /// Makes a bundle of the stand-in `plane` and of what finds and matches keypoints in the product.

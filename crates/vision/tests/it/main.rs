@@ -25,6 +25,7 @@ mod frame;
 mod geometry;
 mod instances;
 mod literal;
+mod matcher;
 mod palette;
 mod photos;
 mod quality;
