@@ -421,6 +421,29 @@ fn only_sets_with_new_photos_go_through_the_network_and_the_others_stay_as_they_
 }
 
 #[test]
+fn what_is_kept_of_photos_that_come_and_leave_does_not_grow() {
+    let Some(engine) = engine() else { return };
+    let photos = sample::photos(&ALL).expect("the options are in range");
+    let set = |of: &[usize]| {
+        let photos = of.iter().map(|&i| photos[i].clone()).collect();
+        PhotoSet::given(photos, Vec::new(), 0.0)
+    };
+    let (options, stop) = (SceneOptions::default(), std::sync::atomic::AtomicBool::new(false));
+    let watch = Watch { progress: &|_, _| (), cancel: &stop };
+    let (mut made, mut seen) = make_keeping(&engine, &set(&[0, 1, 2, 3]), &options, watch).unwrap();
+    let mut sizes = Vec::new();
+    for photo in [4, 5, 4, 5, 4, 5] {
+        let grown = make_more(&engine, &set(&[0, 1, 2, 3, photo]), 4, Some(seen), &options, watch);
+        let grown = grown.expect("grown");
+        (made, seen) = (grown.made, grown.seen.expect("it is kept").only(&[0, 1, 2, 3]));
+        // All that it has, as text.
+        sizes.push(format!("{seen:?}").len());
+    }
+    assert_eq!((seen.photos(), made.report.views_used), (4, 5), "all were used");
+    assert!(sizes.iter().all(|size| *size == sizes[0]), "{sizes:?}");
+}
+
+#[test]
 fn a_scene_that_would_be_worse_at_its_old_photos_keeps_what_it_has() {
     let Some(engine) = engine() else { return };
     let photos = sample::photos(&ALL).expect("the options are in range");

@@ -14,6 +14,7 @@ mod common;
 mod conventions;
 mod fuzz_input;
 mod grow_kill;
+mod grow_stream;
 mod kill;
 mod load;
 mod refine_kill;

@@ -14,9 +14,9 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from served import ROOT
+from served import ROOT, run
 
-from segsplat import Client, Scene
+from segsplat import Camera, Client, Scene
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 # The definitions of vision_msgs 4 (ROS 2), without their comments.
@@ -95,13 +95,13 @@ def test_a_robots_photos_become_a_scene_and_its_boxes_are_published(
     node: ModuleType, client: Client, photos: Path, scene: Scene
 ) -> None:
     stream = messages(node, photos)
-    collector = node.Collector(photos=2, distance=0.05)
-    assert not collector.take(*stream[0])
-    assert not collector.take(*stream[0]), "it has not moved"
-    assert len(collector.taken) == 1
-    assert collector.take(*stream[1])
-    made = collector.scene(client)
-    assert collector.taken == []
+    mapper = node.Mapper(client, photos=2, distance=0.05)
+    assert mapper.take(*stream[0])
+    assert not mapper.take(*stream[0]), "it has not moved"
+    assert len(mapper.first) == 1 and not mapper.scene
+    assert mapper.take(*stream[1])
+    made = mapper.scene
+    assert mapper.first == []
     # The same pixels and cameras as those of the folder.
     for ours, theirs in zip(made.photos, scene.photos, strict=True):
         assert np.abs(ours.camera.camera_to_world - theirs.camera.camera_to_world).max() < 1e-12
@@ -124,6 +124,69 @@ def test_a_robots_photos_become_a_scene_and_its_boxes_are_published(
         corners = at + ends @ node.rotation_of(box.center.orientation).T
         far = np.linalg.norm(corners[:, None] - part.corners[None], axis=2).min(axis=1)
         assert far.max() < 1e-9 * size.max(), match.text
+
+
+def test_photos_join_where_the_scene_lacks_what_they_show(
+    node: ModuleType, client: Client, tmp_path: Path
+) -> None:
+    run("sample", "--photos", "9", "--size", "160x120", "-o", tmp_path / "walk")
+    stream = messages(node, tmp_path / "walk")
+    mapper = node.Mapper(client, photos=3, distance=1e-6, most=4)
+    assert all(mapper.take(*photo) for photo in stream[:3])
+    scene = mapper.scene
+    assert (scene.status.version, len(scene.photos)) == (1, 3)
+    assert scene.status.refinement.state == "none", "it would begin anew with each photo"
+    # Most of it is there: nothing is sent, and it is not looked at again.
+    assert not mapper.take(*stream[4])
+    assert len(mapper.known) == 1 and not mapper.take(*stream[4])
+    assert (scene.status.version, len(mapper.known)) == (1, 1)
+    # Turned about, the robot sees nothing that the scene has: no network could place it.
+    image, info, transform = stream[8]
+    q = transform.rotation
+    turned = types("geometry_msgs/Quaternion")(x=-q.z, y=q.w, z=q.x, w=-q.y)
+    back = types("geometry_msgs/Transform")(
+        translation=transform.translation, rotation=turned)
+    assert node.lacking(scene.view("alpha", camera=node.camera_of(info, back)).alpha) > 0.9
+    assert not mapper.take(image, info, back)
+    assert (scene.status.version, len(mapper.known)) == (1, 1)
+    # What shows more joins.
+    assert mapper.take(image, info, transform)
+    assert (scene.status.version, len(scene.photos), mapper.joined) == (2, 4, 1)
+    alpha = scene.view("alpha", camera=node.camera_of(info, transform), width=160).alpha
+    assert node.lacking(alpha) < 0.1
+    # However many come, the scene has no more than it may: one of the first three is replaced.
+    mapper.new = 0.0
+    assert mapper.take(*stream[6])
+    assert (mapper.joined, len(scene.photos)) == (2, 4)
+    names = [photo.file for photo in scene.photos]
+    assert names[2:] == ["000001-0000.png", "000002-0000.png"]
+    scene.delete()
+
+
+def test_photos_are_chosen_by_place_turn_and_what_is_lacking(node: ModuleType) -> None:
+    def camera(x: float, degrees: float = 0.0) -> Camera:
+        turn, pose = np.radians(degrees), np.eye(4)
+        pose[:3, :3] = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0],
+                        [-np.sin(turn), 0, np.cos(turn)]]
+        pose[0, 3] = x
+        return Camera(np.eye(3), pose, 8, 6)
+
+    there = [camera(0.0), camera(1.0, 90)]
+    for x, degrees, want in [(0.1, 5, False), (0.2, 5, True), (0.1, 20, True),
+                             (0.95, 85, False), (0.95, 5, True), (0.0, 0, False)]:
+        apart = node.stands_apart(camera(x, degrees), there, 0.15, 15)
+        assert apart == want, (x, degrees)
+    assert node.stands_apart(camera(0), [], 0.15, 15)
+    alpha = np.ones((4, 5), np.float32)
+    assert node.lacking(alpha) == 0
+    alpha[0], alpha[1] = 0.49, 0.5
+    assert node.lacking(alpha) == 0.25
+    # 2 and 3 are nearest to each other, and 4 is nearer to 3.
+    walk = [camera(x) for x in (0.0, 1.0, 2.0, 2.2, 2.9)]
+    assert node.replaceable(walk, 0.15, 15) == 3
+    # The same places, but 3 looks elsewhere: 2 and 4 are nearest, and 2 is nearer to 1.
+    walk[3] = camera(2.2, 120)
+    assert node.replaceable(walk, 0.15, 15) == 2
 
 
 def test_turns_and_images_are_read_as_ros_defines_them(node: ModuleType) -> None:

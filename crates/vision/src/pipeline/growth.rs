@@ -13,8 +13,8 @@ use segsplat_render::{
 };
 
 use super::{
-    PhotoSet, Pipeline, Reconstruction, Seen, Stages, lifted, of_sets, see, united, views_of,
-    with_reading,
+    PhotoSet, Pipeline, Reconstruction, Seen, Stages, lifted, of_sets, see, sets::newest, united,
+    views_of, with_reading,
 };
 use crate::{
     capture, center_of,
@@ -72,9 +72,14 @@ impl Seen {
             view.photo = new.unwrap_or_default();
             new.is_some()
         });
-        for set in &mut seen.sets {
+        // Sets say which photos were used; those that say nothing new would be ever more.
+        let mut is_used = vec![false; kept.len()];
+        seen.sets.retain_mut(|set| {
             set.views = set.views.iter().filter_map(|&view| number(view)).collect();
-        }
+            let says_more = set.views.iter().any(|&view| !is_used[view]);
+            set.views.iter().for_each(|&view| is_used[view] = true);
+            says_more
+        });
         let capture = &mut seen.capture;
         capture.near_far = kept.iter().map(|&i| capture.near_far[i]).collect();
         let row = |&i: &usize| kept.iter().map(|&j| self.capture.overlap[i][j]).collect();
@@ -132,7 +137,9 @@ fn see_more(
     let before = known.photos();
     let (capture, sets) = stages.run(Stage::Capture, || {
         pipeline.workers.install(|| {
-            let capture = capture::analyse_more(photos, &known.capture, watch.cancel)?;
+            let mut capture = capture::analyse_more(photos, &known.capture, watch.cancel)?;
+            let new = capture.warnings.split_off(known.capture.warnings.len());
+            capture.warnings = newest(&capture.warnings, &new);
             let most = manifest.neighbors_max;
             let sets = capture::more_view_sets(&capture, photos, before, views, most);
             Ok((capture, sets))

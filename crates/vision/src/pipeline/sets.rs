@@ -50,8 +50,8 @@ impl PhotoSet {
     pub fn joined(mut self, more: Self) -> Self {
         self.photos.retain(|one| !more.photos.iter().any(|other| other.file == one.file));
         self.photos.extend(more.photos);
-        self.warnings.extend(more.warnings);
-        Self { stages: more.stages, ..self }
+        let warnings = newest(&self.warnings, &more.warnings);
+        Self { warnings, stages: more.stages, ..self }
     }
 
     /// The photos of these files, in their order; `None` where one is not there.
@@ -69,6 +69,13 @@ impl PhotoSet {
     pub fn is_of(&self, cameras: &[SceneCamera]) -> bool {
         self.photos.iter().map(|posed| &posed.file).eq(cameras.iter().map(|camera| &camera.file))
     }
+}
+
+/// What is said of photos, and then of `more` that join them: of each kind only the newest, so that
+/// a stream of photos does not say ever more.
+pub(super) fn newest(before: &[Warning], more: &[Warning]) -> Vec<Warning> {
+    let stays = |one: &&Warning| !more.iter().any(|new| new.code == one.code);
+    before.iter().filter(stays).chain(more).cloned().collect()
 }
 
 fn bytes_of(photo: &Photo) -> u64 {
@@ -118,5 +125,21 @@ impl UnposedSet {
         let stages = vec![read_time(read_ms)];
         let cameras = report.clone();
         PhotoSet { photos: posed, warnings, stages, cameras, is_without_words: false }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{PhotoSet, Warning, WarningCode};
+
+    #[test]
+    fn of_each_kind_of_warning_the_newest_stays_where_photos_join() {
+        let said = |code, value: f64| Warning { code, message: value.to_string(), value };
+        let (low, unread) = (WarningCode::LowOverlap, WarningCode::KeysUnread);
+        let set = |warnings: &[Warning]| PhotoSet::given(Vec::new(), warnings.to_vec(), 0.0);
+        let before = set(&[said(low, 1.0), said(unread, 2.0)]);
+        assert_eq!(before.clone().joined(set(&[])).warnings, before.warnings);
+        let joined = before.joined(set(&[said(low, 3.0)]));
+        assert_eq!(joined.warnings, [said(unread, 2.0), said(low, 3.0)]);
     }
 }
