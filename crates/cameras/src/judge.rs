@@ -30,7 +30,7 @@ const TWO_PLACED_FOCAL_KNOWN: f64 = 0.7;
 /// Where each kind of doubt halves the confidence; chosen on seven scenes (`docs/adr`, number 71).
 const WEAKEST_MIN: f64 = 0.5;
 /// Added where the links are a tree: no loop shows what is wrong.
-const WEAKEST_OF_TREE: f64 = 0.12;
+const WEAKEST_OF_TREE: f64 = 0.2;
 const AGREEING_MIN: f64 = 0.75;
 pub(crate) const EXPLAINED_MIN: f64 = 0.8;
 pub(crate) const RIVAL_MAX: f64 = 0.95;
