@@ -28,7 +28,7 @@ const SURE_SHARE: f64 = 0.5;
 const SURE_INLIERS: usize = 60;
 const BY_LINK_MIN: usize = 5;
 /// Angle between two rays to a point, degrees, under which its depth is not known.
-const ANGLE_MIN_DEG: f64 = 1.0;
+const ANGLE_MIN_DEG: f64 = 0.5;
 /// Cameras from which on the focal length and the radial term move.
 const FREE_FOCAL: usize = 3;
 const FREE_K1: usize = 4;

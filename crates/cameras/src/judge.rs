@@ -8,9 +8,8 @@ use crate::{
     grow::{Grower, Grown, angle_between},
     pose::{Pose, angle_deg},
     solution::Evidence,
-    solver::{Candidate, between, explained, shares},
+    solver::{Candidate, between, explained, score_of, shares},
     survey::{Link, Survey},
-    tracks::Sighting,
 };
 
 /// What is short is not cancelled.
@@ -31,7 +30,7 @@ const TWO_PLACED_FOCAL_KNOWN: f64 = 0.7;
 /// Where each kind of doubt halves the confidence; chosen on seven scenes (`docs/adr`, number 71).
 const WEAKEST_MIN: f64 = 0.5;
 /// Added where the links are a tree: no loop shows what is wrong.
-const WEAKEST_OF_TREE: f64 = 0.12;
+const WEAKEST_OF_TREE: f64 = 0.2;
 const AGREEING_MIN: f64 = 0.75;
 pub(crate) const EXPLAINED_MIN: f64 = 0.8;
 pub(crate) const RIVAL_MAX: f64 = 0.95;
@@ -125,24 +124,31 @@ pub(crate) fn confidence(evidence: &Evidence) -> f64 {
         * rising(-evidence.missing, -MISSING_MAX, 0.03)
 }
 
-/// Sightings that agree with their points, in photos that `best` placed.
-fn fit(best: &Candidate, grown: &Grown, tracks: &[Vec<Sighting>]) -> f64 {
-    let sightings = tracks.iter().flatten().zip(grown.agrees.iter().flatten());
-    let near = sightings
-        .filter(|(sighting, agrees)| **agrees && best.grown.poses[sighting.0 as usize].is_some());
-    near.count() as f64
+/// The score of the best solution that differs, over the photos that `best` places, as a share of
+/// that of `best`.
+pub(crate) fn rival(survey: &Survey, best: &Candidate, others: &[Candidate]) -> f64 {
+    let of = |other: &Candidate| {
+        let mut grown = other.grown.clone();
+        for (pose, own) in grown.poses.iter_mut().zip(&best.grown.poses) {
+            *pose = pose.filter(|_| own.is_some());
+        }
+        score_of(survey, &grown) / best.score.max(1.0)
+    };
+    let differs = |other: &&Candidate| {
+        difference_deg(&best.grown, &other.grown).is_some_and(|angle| angle > DIFFERENT_DEG)
+    };
+    others.iter().filter(differs).map(of).fold(0.0, f64::max)
 }
 
-/// The evidence for a solution; `relinked` are the links under its lenses, `others` the other
-/// solutions.
+/// The evidence for a solution; `relinked` are the links under its lenses, `rival` is that of
+/// [`rival`].
 pub(crate) fn evidence(
     survey: &Survey,
     best: &Candidate,
     relinked: &[Link],
-    others: &[Candidate],
+    rival: f64,
 ) -> Evidence {
     let grown = &best.grown;
-    let own_fit = fit(best, grown, &best.tracks).max(1.0);
     let (mut links, mut all, mut agreeing, mut inliers, mut near) = (0, 0.0, 0.0, 0.0, 0.0);
     for link in relinked {
         let [a, b] = link.photos;
@@ -157,13 +163,6 @@ pub(crate) fn evidence(
             agreeing += own;
         }
     }
-    let rival = others
-        .iter()
-        .filter(|other| {
-            difference_deg(grown, &other.grown).is_some_and(|angle| angle > DIFFERENT_DEG)
-        })
-        .map(|other| fit(best, &other.grown, &other.tracks) / own_fit)
-        .fold(0.0, f64::max);
     let mirrored = mirrored(survey, best);
     let mut held = vec![0; grown.poses.len()];
     let mut angles = Vec::new();

@@ -44,9 +44,12 @@ pub fn solve(
             warnings: vec!["no two photos show enough of the same things".to_owned()],
         });
     };
-    let (links, dropped) = solver::drop_weak(&survey, &mut best, cancel);
     let others: Vec<solver::Candidate> = candidates.collect();
-    let evidence = judge::evidence(&survey, &best, &links, &others);
+    // As they were grown: what is finished explains more than what is not.
+    let rival = judge::rival(&survey, &best, &others);
+    solver::finish(&survey, &mut best, cancel);
+    let (links, dropped) = solver::drop_weak(&survey, &mut best, cancel);
+    let evidence = judge::evidence(&survey, &best, &links, rival);
     let why_not = |photo| report::why_left_out(&survey, photo, &dropped);
     let (placings, points) = world::outcome(photos, &survey, &best, why_not)?;
     let confidence = judge::confidence(&evidence);

@@ -13,7 +13,7 @@ use crate::{
     lens::Lens,
     pose::Pose,
     rotations,
-    survey::{Link, Pair, Survey, View},
+    survey::{Link, Pair, Survey, View, strength},
     tracks::{self, Sighting},
     two_view,
 };
@@ -32,6 +32,10 @@ const PHOTOS_MANY: usize = 32;
 /// A pair is a link of the view graph where chance gives so many such agreements at most.
 const LOG_CHANCE_MAX: f64 = -8.0;
 const LINK_INLIERS_MIN: usize = 15;
+/// Rounds in which a solution gathers the matches that agree with it, while its score grows so.
+const FINISH_ROUNDS: usize = 4;
+const FINISH_GAIN: f64 = 1.01;
+const KEPT_SHARE: f64 = 0.95;
 /// A photo is held by a pair of which the cameras explain this share at least. Photos that only
 /// look alike agree in a third of their matches by the outline of things.
 const WEAK_SHARE: f64 = 0.42;
@@ -91,7 +95,11 @@ pub(crate) fn survey(
 }
 
 fn is_link(link: &Link) -> bool {
-    link.geometry.log_chance < LOG_CHANCE_MAX && link.geometry.inliers.len() >= LINK_INLIERS_MIN
+    is_more_than_chance(link.geometry.inliers.len(), link.geometry.log_chance)
+}
+
+fn is_more_than_chance(inliers: usize, log_chance: f64) -> bool {
+    log_chance < LOG_CHANCE_MAX && inliers >= LINK_INLIERS_MIN
 }
 
 /// All candidates, the best first.
@@ -120,6 +128,63 @@ pub(crate) fn candidates(
     unless_cancelled(cancel)?;
     progress(0.9);
     Ok(all)
+}
+
+/// Goes on from a solution with all matches that agree with it, those that two views alone left out
+/// among them, and looks again for the places of the photos that are left.
+pub(crate) fn finish(survey: &Survey, best: &mut Candidate, cancel: &AtomicBool) {
+    for _ in 0..FINISH_ROUNDS {
+        let tracks = retracked(survey, &best.grown);
+        let mut grower = Grower::new(survey, &tracks, &best.links, &best.grown.lenses, cancel);
+        grower.state.poses.clone_from(&best.grown.poses);
+        let before = grower.placed();
+        grower.triangulate();
+        grower.place_all(survey.seed);
+        let score = score_of(survey, &grower.state);
+        let gained = score / best.score;
+        if grower.placed() < before || gained < KEPT_SHARE {
+            return;
+        }
+        let Grower { state, .. } = grower;
+        (best.grown, best.score, best.tracks) = (state, score, tracks);
+        if gained < FINISH_GAIN {
+            return;
+        }
+    }
+}
+
+/// Tracks of the matches that agree with a solution.
+fn retracked(survey: &Survey, grown: &Grown) -> Vec<Vec<Sighting>> {
+    let mut agreeing: Vec<(f64, &Pair, Vec<u32>)> = Vec::new();
+    for pair in &survey.pairs {
+        let Some(pose) = between_placed(grown, pair.photos) else { continue };
+        let directions = survey.directions(pair, &grown.lenses);
+        let threshold = survey.threshold(pair, &grown.lenses);
+        let near = two_view::inliers_of(&pose, &directions, threshold * threshold);
+        let log_chance = two_view::log_chance_of(&directions, near.len(), threshold);
+        if is_more_than_chance(near.len(), log_chance) {
+            let share = near.len() as f64 / pair.matches.len() as f64;
+            agreeing.push((strength(near.len(), share), pair, near));
+        }
+    }
+    agreeing.sort_by(|a, b| b.0.total_cmp(&a.0));
+    joined(survey, agreeing.iter().map(|(_, pair, near)| (*pair, &**near)))
+}
+
+/// Tracks of matches of pairs of photos, those of the first pairs before others.
+fn joined<'a>(
+    survey: &Survey,
+    matches: impl Iterator<Item = (&'a Pair, &'a [u32])>,
+) -> Vec<Vec<Sighting>> {
+    let counts: Vec<usize> = survey.views.iter().map(|v| v.pixels.len()).collect();
+    let sightings = matches.flat_map(|(pair, agreeing)| {
+        let [a, b] = pair.photos.map(|p| p as u32);
+        agreeing.iter().map(move |&i| {
+            let [k, l] = pair.matches[i as usize];
+            [(a, k), (b, l)]
+        })
+    });
+    tracks::join(&counts, sightings)
 }
 
 /// Takes photos out of a solution that no pair holds: in which the cameras explain less than
@@ -166,14 +231,21 @@ pub(crate) fn shares(survey: &Survey, links: &[Link], grown: &Grown) -> Vec<f64>
     shares
 }
 
-/// The links under the lenses that a solution found.
+/// The links under the lenses that a solution found: each with the geometry that its own matches
+/// fit best, or with that of the solution, where they fit it nearly as well.
 fn links_under(survey: &Survey, best: &Candidate) -> Vec<Link> {
     let mut before: Vec<Option<Link>> = vec![None; survey.pairs.len()];
     for link in &best.links {
         before[link.pair] = Some(link.clone());
     }
     let links = survey.links(&best.grown.lenses, 60, Some(&before));
-    links.into_iter().flatten().filter(is_link).collect()
+    let mut links: Vec<Link> = links.into_iter().flatten().filter(is_link).collect();
+    for link in &mut links {
+        if let Some(pose) = between_placed(&best.grown, link.photos) {
+            survey.lean(link, &pose, &best.grown.lenses);
+        }
+    }
+    links
 }
 
 /// Lenses with the focal lengths under which the pairs agree best.
@@ -221,18 +293,10 @@ fn grow_from_pairs(
     links: &[Link],
     cancel: &AtomicBool,
 ) -> Vec<Candidate> {
-    let counts: Vec<usize> = survey.views.iter().map(|v| v.pixels.len()).collect();
     let mut order: Vec<&Link> = links.iter().collect();
     order.sort_by(|a, b| b.geometry.score.total_cmp(&a.geometry.score).then(a.pair.cmp(&b.pair)));
-    let sightings = order.iter().flat_map(|link| {
-        let pair = &survey.pairs[link.pair];
-        let [a, b] = pair.photos.map(|p| p as u32);
-        link.geometry.inliers.iter().map(move |&i| {
-            let [k, l] = pair.matches[i as usize];
-            [(a, k), (b, l)]
-        })
-    });
-    let tracks = tracks::join(&counts, sightings);
+    let matches = order.iter().map(|link| (&survey.pairs[link.pair], &*link.geometry.inliers));
+    let tracks = joined(survey, matches);
     let many = survey.views.len() > PHOTOS_MANY;
     let seeds = first_pairs(links, if many { SEEDS_OF_MANY } else { SEEDS });
     let grown: Vec<Candidate> = seeds
@@ -241,7 +305,7 @@ fn grow_from_pairs(
             let mut grower = Grower::new(survey, &tracks, links, lenses, cancel);
             grower.grow(link.photos, link.geometry.pose, survey.seed);
             (grower.placed() >= 2).then(|| Candidate {
-                score: score_of(survey, links, &grower.state),
+                score: score_of(survey, &grower.state),
                 grown: grower.state,
                 links: links.to_vec(),
                 tracks: tracks.clone(),
@@ -284,18 +348,28 @@ pub(crate) fn between(first: &Pose, second: &Pose) -> Pose {
     Pose { r, t: t.try_normalize(1e-12).unwrap_or_default() }
 }
 
-/// How many of the links' matches a solution explains.
-pub(crate) fn score_of(survey: &Survey, links: &[Link], grown: &Grown) -> f64 {
-    links.iter().map(|link| explained(survey, link, grown).map_or(0.0, |e| e.0)).sum()
+/// How well a solution explains the matches of all pairs of photos that it places.
+pub(crate) fn score_of(survey: &Survey, grown: &Grown) -> f64 {
+    let of = |pair: &Pair| {
+        let pose = between_placed(grown, pair.photos)?;
+        let directions = survey.directions(pair, &grown.lenses);
+        Some(two_view::fit(&pose, &directions, survey.threshold(pair, &grown.lenses)))
+    };
+    survey.pairs.iter().filter_map(of).sum()
+}
+
+/// The pose of the second of two placed photos from the first.
+fn between_placed(grown: &Grown, photos: [usize; 2]) -> Option<Pose> {
+    let [first, second] = photos.map(|photo| grown.poses[photo].as_ref());
+    Some(between(first?, second?))
 }
 
 /// Matches of a link's pair that a solution explains, and those that the link's own geometry does.
 pub(crate) fn explained(survey: &Survey, link: &Link, grown: &Grown) -> Option<(f64, f64)> {
-    let [a, b] = link.photos;
-    let (first, second) = (grown.poses[a].as_ref()?, grown.poses[b].as_ref()?);
+    let pose = between_placed(grown, link.photos)?;
     let pair = &survey.pairs[link.pair];
     let directions = survey.directions(pair, &grown.lenses);
     let threshold = survey.threshold(pair, &grown.lenses);
-    let near = two_view::inliers_of(&between(first, second), &directions, threshold * threshold);
+    let near = two_view::inliers_of(&pose, &directions, threshold * threshold);
     Some((near.len() as f64, link.geometry.inliers.len() as f64))
 }

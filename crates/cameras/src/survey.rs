@@ -7,12 +7,16 @@ use rayon::prelude::*;
 use crate::{
     adjust::LensPrior,
     lens::Lens,
+    pose::Pose,
     rng::Rng,
     two_view::{self, Directions, TwoView},
 };
 
 /// Distance at which a keypoint still agrees, as a share of the photo's longer side.
 const AGREE_SHARE: f64 = 0.003;
+
+/// The share of the score of a link's own geometry with which another is as good.
+const AS_GOOD: f64 = 0.85;
 
 /// A photo as the solver sees it.
 #[derive(Debug)]
@@ -58,8 +62,13 @@ impl Link {
     /// How far the pair is trusted. Photos of different sides of a thing give many matches that
     /// agree by its outline, but never most of them.
     pub(crate) fn strength(&self) -> f64 {
-        self.geometry.inliers.len() as f64 * self.share.powi(3)
+        strength(self.geometry.inliers.len(), self.share)
     }
+}
+
+/// [`Link::strength`] of so many matches that agree, and their share of all.
+pub(crate) fn strength(agreeing: usize, share: f64) -> f64 {
+    agreeing as f64 * share.powi(3)
 }
 
 impl View {
@@ -90,6 +99,19 @@ impl Survey {
         0.5 * (each[0] + each[1])
     }
 
+    /// Takes the geometry next to a pose as that of a link, where the matches fit it nearly as well
+    /// as the link's own: a plane has two poses, and two photos from one place have many.
+    pub(crate) fn lean(&self, link: &mut Link, pose: &Pose, lenses: &[Lens]) {
+        let pair = &self.pairs[link.pair];
+        let (directions, threshold) = (self.directions(pair, lenses), self.threshold(pair, lenses));
+        let (pose, score) = two_view::next_to(pose, &directions, threshold);
+        if score >= AS_GOOD * link.geometry.score {
+            let mut rng = Rng::new(self.seed, link.pair as u64);
+            link.geometry = two_view::describe(pose, score, &directions, threshold, &mut rng);
+            link.share = link.geometry.inliers.len() as f64 / pair.matches.len() as f64;
+        }
+    }
+
     /// The geometry of each pair under lenses; `before` has what was found under others.
     pub(crate) fn links(
         &self,
@@ -112,5 +134,59 @@ impl Survey {
             Some(Link { pair: index, photos: pair.photos, geometry, share })
         };
         self.pairs.par_iter().enumerate().map(of).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Vector2, Vector3};
+
+    use super::{Link, Pair, Survey, View};
+    use crate::{
+        adjust::LensPrior,
+        lens::Lens,
+        pose::{Pose, angle_deg, rotation},
+        rng::Rng,
+        two_view,
+    };
+
+    #[test]
+    fn a_link_of_photos_from_one_place_leans_on_a_solution_and_one_of_others_does_not() {
+        let turn = rotation(&Vector3::new(0.05, 0.1, 0.0));
+        let right = Pose { r: turn, t: Vector3::x() };
+        // From one place any step fits.
+        for (step, leans) in [(0.0, true), (1.0, false)] {
+            let mut rng = Rng::new(5, 0);
+            let mut draw = || rng.below(1 << 20) as f64 / f64::from(1 << 20) - 0.5;
+            let lens = Lens { focal: 500.0, k1: 0.0 };
+            let mut pixels = [Vec::new(), Vec::new()];
+            for _ in 0..200 {
+                let point = Vector3::new(4.0 * draw(), 3.0 * draw(), 6.0 + 4.0 * draw());
+                let seen = turn * point + right.t * step;
+                for (pixels, seen) in pixels.iter_mut().zip([point, seen]) {
+                    pixels.push(lens.pixel(&(seen.xy() / seen.z)) + Vector2::new(draw(), draw()));
+                }
+            }
+            let view =
+                |pixels| View { lens: 0, pixels, agree_px: 2.0, side: 640.0, size: [640.0, 480.0] };
+            let prior = LensPrior { focal: 500.0, log_spread: 0.1, known: true, k1_spread: 0.1 };
+            let survey = Survey {
+                views: pixels.map(view).into(),
+                pairs: vec![Pair { photos: [0, 1], matches: (0..200).map(|i| [i, i]).collect() }],
+                priors: vec![prior],
+                seed: 0,
+            };
+            let pair = &survey.pairs[0];
+            let (directions, threshold) =
+                (survey.directions(pair, &[lens]), survey.threshold(pair, &[lens]));
+            let (pose, score) = two_view::next_to(&right, &directions, threshold);
+            let geometry = two_view::describe(pose, score, &directions, threshold, &mut rng);
+            let mut link = Link { pair: 0, photos: [0, 1], geometry, share: 1.0 };
+            let other = Pose { r: turn, t: Vector3::y() };
+            survey.lean(&mut link, &other, &[lens]);
+            let off = link.geometry.pose.t.cross(&Vector3::y()).norm().asin().to_degrees();
+            assert_eq!(off < 45.0, leans, "{off} degrees from the step of the solution");
+            assert!(angle_deg(&(link.geometry.pose.r * turn.transpose())) < 1.0 || leans);
+        }
     }
 }

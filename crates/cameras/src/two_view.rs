@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Matrix5, Vector2, Vector3, Vector5};
 
 use crate::{
     five_point::{essentials, poses_of},
-    pose::{Pose, best_rotation, cross},
+    pose::{Pose, best_rotation, cross, project},
     rng::Rng,
 };
 
@@ -26,6 +26,11 @@ pub(crate) struct Directions {
 impl Directions {
     pub(crate) fn len(&self) -> usize {
         self.first.len()
+    }
+
+    fn only(&self, matches: &[u32]) -> Self {
+        let of = |side: &[Vector2<f64>]| matches.iter().map(|&i| side[i as usize]).collect();
+        Self { first: of(&self.first), second: of(&self.second) }
     }
 }
 
@@ -105,6 +110,14 @@ pub(crate) fn inliers_of(pose: &Pose, matches: &Directions, t2: f64) -> Vec<u32>
         }
     };
     (0..matches.len() as u32).filter(agrees).collect()
+}
+
+/// The score of a pose over the matches that lie in front of both cameras.
+pub(crate) fn fit(pose: &Pose, matches: &Directions, threshold: f64) -> f64 {
+    let (e, t2) = (essential_of(pose), threshold * threshold);
+    let worth =
+        |i: u32| 1.0 - sampson(&e, &matches.first[i as usize], &matches.second[i as usize]) / t2;
+    inliers_of(pose, matches, t2).into_iter().map(worth).sum()
 }
 
 /// The pose of an essential matrix that has most matches in front of both cameras.
@@ -221,11 +234,24 @@ pub(crate) fn find(
             break;
         }
     }
-    let (pose, _) = best?;
-    let pose = refine(&pose, matches, t2, 10);
-    let pose = in_front(&essential_of(&pose), matches, t2)?;
-    let score = score_of(&essential_of(&pose), matches, t2, 0.0);
-    Some((pose, score))
+    let settled = |pose: &Pose| {
+        let e = essential_of(&refine(pose, matches, t2, 10));
+        Some((in_front(&e, matches, t2)?, score_of(&e, matches, t2, 0.0)))
+    };
+    let found = settled(&best?.0)?;
+    // Samples on a plane end at either of its two poses: the better one is not always met.
+    let near = inliers_of(&found.0, matches, t2);
+    let (plane, _) = plane_of(&matches.only(&near), t2, rng);
+    let of_plane = plane.as_ref().and_then(poses_of_plane).into_iter().flatten();
+    let all = of_plane.filter_map(|pose| settled(&pose));
+    Some(all.fold(found, |best, other| if other.1 > best.1 { other } else { best }))
+}
+
+/// The pose next to one that the matches fit best, and its score.
+pub(crate) fn next_to(pose: &Pose, matches: &Directions, threshold: f64) -> (Pose, f64) {
+    let t2 = threshold * threshold;
+    let pose = refine(pose, matches, t2, 10);
+    (pose, score_of(&essential_of(&pose), matches, t2, 0.0))
 }
 
 /// Logarithm (base 10) of the expected number of sets of `inliers` of `count` matches that agree by
@@ -239,6 +265,12 @@ fn log_chance(count: usize, inliers: usize, p: f64) -> f64 {
     choose(count, inliers) + choose(inliers, 5) + (inliers - 5) as f64 * p.log10() + 1.0
 }
 
+/// [`TwoView::log_chance`] of a number of matches that agree.
+pub(crate) fn log_chance_of(matches: &Directions, inliers: usize, threshold: f64) -> f64 {
+    let p = (2.0 * threshold / spread_of(&matches.second)).min(0.5);
+    log_chance(matches.len(), inliers, p)
+}
+
 /// Everything about a pair whose pose is known.
 pub(crate) fn describe(
     pose: Pose,
@@ -249,13 +281,8 @@ pub(crate) fn describe(
 ) -> TwoView {
     let t2 = threshold * threshold;
     let inliers = inliers_of(&pose, matches, t2);
-    let spread = spread_of(&matches.second);
-    let p = (2.0 * threshold / spread).min(0.5);
-    let log_chance = log_chance(matches.len(), inliers.len(), p);
-    let near: Directions = Directions {
-        first: inliers.iter().map(|&i| matches.first[i as usize]).collect(),
-        second: inliers.iter().map(|&i| matches.second[i as usize]).collect(),
-    };
+    let log_chance = log_chance_of(matches, inliers.len(), threshold);
+    let near = matches.only(&inliers);
     let unit = |d: &Vector2<f64>| d.push(1.0).normalize();
     let mut angles: Vec<f64> = near
         .first
@@ -269,7 +296,7 @@ pub(crate) fn describe(
         score,
         log_chance,
         rotation_share: rotation_share(&near, t2),
-        plane_share: plane_share(&near, t2, rng),
+        plane_share: plane_of(&near, t2, rng).1,
         angle_deg: angles.get(angles.len() / 2).copied().unwrap_or(0.0),
         inliers,
     }
@@ -307,13 +334,13 @@ fn rotation_share(matches: &Directions, t2: f64) -> f64 {
     share
 }
 
-/// Share of matches that one homography explains.
-fn plane_share(matches: &Directions, t2: f64, rng: &mut Rng) -> f64 {
+/// The homography that most matches agree with, and their share.
+fn plane_of(matches: &Directions, t2: f64, rng: &mut Rng) -> (Option<Matrix3<f64>>, f64) {
     let count = matches.len();
     if count < 8 {
-        return 1.0;
+        return (None, 1.0);
     }
-    let mut best = 0;
+    let mut best = (None, 0);
     for _ in 0..60 {
         let picked = rng.sample::<4>(count);
         let Some(h) =
@@ -325,9 +352,36 @@ fn plane_share(matches: &Directions, t2: f64, rng: &mut Rng) -> f64 {
             let seen = h * matches.first[i].push(1.0);
             (seen.xy() / seen.z - matches.second[i]).norm_squared() < 2.0 * t2
         });
-        best = best.max(near.count());
+        let near = near.count();
+        if near > best.1 {
+            best = (Some(h), near);
+        }
     }
-    best as f64 / count as f64
+    (best.0, best.1 as f64 / count as f64)
+}
+
+/// The two poses, up to the sign of the step, under which a plane is seen as a homography says (Ma,
+/// Soatto, Košecká and Sastry, "An invitation to 3-D vision", 2004, 5.3.3); `None` where it is
+/// nearly a rotation.
+fn poses_of_plane(h: &Matrix3<f64>) -> Option<[Pose; 2]> {
+    let middle = h.try_svd(false, false, 1e-14, 100)?.singular_values[1];
+    let h = h / (middle * h.determinant().signum());
+    let eigen = (h.transpose() * h).try_symmetric_eigen(1e-14, 100)?;
+    let mut order = [0, 1, 2];
+    order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
+    let [most, _, least] = order.map(|i| eigen.eigenvalues[i]);
+    let [v1, v2, v3] = order.map(|i| eigen.eigenvectors.column(i).into_owned());
+    let (along, across) = ((1.0 - least).max(0.0).sqrt(), (most - 1.0).max(0.0).sqrt());
+    let pose = |sign: f64| {
+        // Two directions of the plane that keep their lengths.
+        let u = (v1 * along + v3 * (sign * across)).try_normalize(1e-6)?;
+        let normal = v2.cross(&u);
+        let (to_v, to_u) = (h * v2, h * u);
+        let to = Matrix3::from_columns(&[to_v, to_u, to_v.cross(&to_u)]);
+        let r = project(&(to * Matrix3::from_columns(&[v2, u, normal]).transpose()))?;
+        Some(Pose { r, t: ((h - r) * normal).try_normalize(1e-9)? })
+    };
+    Some([pose(1.0)?, pose(-1.0)?])
 }
 
 /// The homography of four pairs.
@@ -339,4 +393,59 @@ fn homography(a: [Vector2<f64>; 4], b: [Vector2<f64>; 4]) -> Option<Matrix3<f64>
         well.then(|| m * Matrix3::from_diagonal(&scale))
     };
     Some(basis(b)? * basis(a)?.try_inverse()?)
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Vector2, Vector3};
+
+    use super::{Directions, find, poses_of_plane};
+    use crate::{
+        pose::{Pose, angle_deg, rotation},
+        rng::Rng,
+    };
+
+    const NORMAL: Vector3<f64> = Vector3::new(0.1, -0.5, 0.86);
+    const FAR: f64 = 4.0;
+
+    fn truth() -> Pose {
+        let t = Vector3::new(-1.2, 0.3, 0.9);
+        Pose { r: rotation(&Vector3::new(0.1, 0.5, -0.2)), t: t.normalize() }
+    }
+
+    /// The poses of the plane that is [`FAR`] along [`NORMAL`].
+    fn of_plane() -> [Pose; 2] {
+        let Pose { r, t } = truth();
+        poses_of_plane(&((r + t * NORMAL.normalize().transpose() / FAR) * -3.0)).expect("two poses")
+    }
+
+    fn off(pose: &Pose) -> f64 {
+        let Pose { r, t } = truth();
+        angle_deg(&(pose.r * r.transpose())).max(pose.t.cross(&t).norm().asin().to_degrees())
+    }
+
+    #[test]
+    fn one_of_the_two_poses_of_a_plane_is_the_right_one() {
+        let off = of_plane().map(|pose| off(&pose));
+        assert!(off[0].min(off[1]) < 1e-6 && off[0].max(off[1]) > 5.0, "{off:?}");
+    }
+
+    #[test]
+    fn a_pair_that_begins_with_the_other_pose_of_a_plane_ends_with_the_right_one() {
+        let mut rng = Rng::new(3, 0);
+        let mut draw = || rng.below(1 << 20) as f64 / f64::from(1 << 20) - 0.5;
+        let mut matches = Directions::default();
+        for i in 0..300 {
+            let ray = Vector2::new(draw(), draw()).push(1.0);
+            // Every eighth point stands before the plane.
+            let depth = if i % 8 == 0 { 0.6 + 0.3 * draw() } else { 1.0 };
+            let point = ray * (depth * FAR / NORMAL.normalize().dot(&ray));
+            let seen = truth().seen(&point);
+            matches.first.push(ray.xy());
+            matches.second.push(seen.xy() / seen.z + Vector2::new(draw(), draw()) * 1e-3);
+        }
+        let wrong = of_plane().into_iter().max_by(|a, b| off(a).total_cmp(&off(b)));
+        let (pose, _) = find(&matches, 4e-3, 0, wrong, &mut Rng::new(1, 0)).expect("a pose");
+        assert!(off(&pose) < 0.5, "{} degrees", off(&pose));
+    }
 }

@@ -112,6 +112,31 @@ fn a_camera_that_only_turns_gives_no_cameras() {
 }
 
 #[test]
+fn photos_from_nearly_one_place_are_solved_by_what_is_far() {
+    // No two rays to a point meet at one degree.
+    let at = |i: usize| DVec3::new(0.016 * i as f64, 0.0, -4.0);
+    let cameras = (0..5).map(|i| Truth::looking_at(at(i), DVec3::ZERO)).collect();
+    let plan = Plan { noise: 0.1, cameras, ..plan() };
+    let (mut photos, pairs) = photos(&plan);
+    for photo in &mut photos {
+        photo.focal = Some(plan.focal);
+    }
+    let off = off(&solved(&photos, &pairs).expect("an answer"), &plan);
+    assert_eq!(off.placed, 5);
+    assert!(off.degrees < 0.5, "{} degrees", off.degrees);
+}
+
+#[test]
+fn matches_that_two_photos_alone_leave_out_are_gathered() {
+    let plan = Plan { noise: 1.0, wrong: 0.3, ..plan() };
+    let (photos, pairs) = photos(&plan);
+    let solution = solved(&photos, &pairs).expect("a solution");
+    let sights: usize = solution.points.iter().map(|point| point.track.len()).sum();
+    let all: usize = photos.iter().map(|photo| photo.keypoints.len()).sum();
+    assert!(20 * sights > 16 * all, "{sights} of {all} keypoints have a point");
+}
+
+#[test]
 fn a_plane_is_solved_where_the_focal_length_is_known() {
     let tilt = DMat3::from_rotation_x(0.9);
     let flat = |p: DVec3| tilt * DVec3::new(p.x * 1.5, p.y * 1.5, 0.0);
