@@ -74,9 +74,6 @@ const NOT_ON_THE_COMMAND_LINE: Absent = &[
 
 const NOT_ON_THE_PAGE: Absent = &[
     ("refine_scene", "it takes the machine for minutes: an operator or a program asks for it"),
-    ("add_photos", "photos join from a program, as a robot takes them"),
-    ("remove_photo", "photos leave by a program"),
-    ("Scene.growth", "photos join and leave by a program"),
     ("render_view.*", "a small picture of what a photo shows, as the server draws it"),
     ("render_views", "the page draws the scene itself"),
     ("features", "arrays are for programs"),
@@ -304,6 +301,7 @@ async fn the_page_has_what_http_has() {
         match (end, &**verb) {
             ("{id}", "DELETE") => html.contains("method: 'DELETE'"),
             ("{id}", _) => html.contains("`/v1/scenes/${"),
+            ("{name}", "DELETE") => html.contains("/photos/${"),
             ("scenes", "POST") => html.contains("send('/v1/scenes'"),
             ("scenes", _) => html.contains("'/v1/scenes' +"),
             ("models", _) => html.contains("/v1/models"),
