@@ -44,7 +44,7 @@ function row(item) {
   const remove = make('button', {
     type: 'button',
     textContent: '×',
-    onclick: () => askDeletion('delete', nameOf(id), () => deleteScene(id)),
+    onclick: () => askDeletion(id),
   });
   return make('li', {}, button, labelled(remove, t('delete', { name: nameOf(id) })));
 }
@@ -130,11 +130,15 @@ function markStop(photo) {
 }
 
 // ---- deletion ---------------------------------------------------------------------------------
-// The dialog closes with what is chosen; Escape chooses nothing. `what` is how its texts begin.
-function askDeletion(what, name, act) {
-  $('deletion-title').textContent = t(`${what}.ask`, { name });
-  for (const part of ['what', 'ever', 'yes'])
-    $(`deletion-${part}`).textContent = t(`${what}.${part}`);
+function askDeletion(id) {
+  const title = t('delete.ask', { name: nameOf(id) }),
+    texts = { what: t('delete.what'), ever: t('delete.ever'), yes: t('delete.yes') };
+  askFirst({ title, ...texts }, () => deleteScene(id));
+}
+
+// The dialog closes with what is chosen; Escape chooses nothing.
+function askFirst(texts, act) {
+  for (const [part, text] of Object.entries(texts)) $(`deletion-${part}`).textContent = text;
   $('deletion').returnValue = '';
   $('deletion').onclose = () => {
     if ($('deletion').returnValue) act().catch(failed);

@@ -71,7 +71,9 @@ function askLeaving() {
   const { id } = state.scene,
     { file } = frames.get(state.camera);
   const path = `/v1/scenes/${encodeURIComponent(id)}/photos/${encodeURIComponent(file)}`;
-  askDeletion('leave', file, async () =>
+  const title = t('leave.ask', { name: file }),
+    texts = { what: t('leave.what'), ever: t('leave.ever'), yes: t('leave.yes') };
+  askFirst({ title, ...texts }, async () =>
     followChange(await server.json(path, { method: 'DELETE' })),
   );
 }

@@ -31,8 +31,11 @@ PLAY = """async ([coded, times]) => {
   Object.assign(canvas, { width, height });
   for (const time of times) {
     const sought = new Promise((ok) => { video.onseeked = ok; });
+    // On a busy machine the picture of a place comes after the word that it is there.
+    const shows = new Promise((ok) => video.requestVideoFrameCallback(ok));
     video.currentTime = time;
     await sought;
+    await Promise.race([shows, new Promise((ok) => setTimeout(ok, 2000))]);
     canvas.getContext('2d').drawImage(video, 0, 0);
     shown.push(canvas.toDataURL('image/png').split(',')[1]);
   }
