@@ -81,14 +81,13 @@ function askLeaving() {
 // Waits until the scene is served with the photos that it has now, and shows it: the camera, the
 // words and the edits stay. `told` is what the server answered to the change.
 async function followChange(told) {
-  const { id } = told,
-    { signal } = watching,
+  const { id } = told;
+  if (state.scene?.id !== id) return; // another scene was opened while the photos were sent
+  const { signal } = watching,
     path = `/v1/scenes/${encodeURIComponent(id)}`,
     before = state.scene.cameras.length;
   while (told.growth.state === 'running') {
-    const { stage, fraction } = told.growth;
-    step.at('changing', fraction);
-    if (stage) say(`${t(`stage.${stage}`)}: ${Math.round(100 * fraction)} %`);
+    if (told.growth.stage) progress({ ...told.growth, event: 'running' });
     await new Promise((resolve) => setTimeout(resolve, 300));
     told = await server.json(path, { signal });
   }
