@@ -7,7 +7,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from acts import drop, open_scenes, post, sample, settled
+from acts import drop, open_scenes, post, sample, settled, until
 from playwright.sync_api import Page, Route, expect
 from served import run
 from test_panels import grave
@@ -113,3 +113,25 @@ def test_words_of_what_is_left_out_are_sent(
     expect(page.locator("#says")).to_have_text("enough seen")
     words = sent[0].split(b'name="ignore"\r\n\r\n')[1:]
     assert [word.split(b"\r\n")[0] for word in words] == [b"person", b"car"]
+
+
+def test_a_scene_that_is_opened_meanwhile_stays(
+        page: Page, url: str, capture: dict[str, bytes], splats: str) -> None:
+    scene = made(url, cut(capture, [0, 1, 3]))
+    page.goto(f"{url}/#scene={scene}")
+    settled(page)
+    open_scenes(page)
+    page.get_by_label("Add to the scene that is shown").check()
+    held: list[Route] = []
+    page.route("**/photos", lambda route: held.append(route))
+    drop(page, cut(capture, [4]))
+    while not held:
+        page.wait_for_timeout(50)
+    page.goto(f"{url}/#scene={splats}")
+    until(page, f"segsplat.state.scene?.id === '{splats}'")
+    held[0].continue_()
+    while len(names(url, scene)) < 4:
+        page.wait_for_timeout(100)
+    page.wait_for_timeout(1000)
+    settled(page)
+    assert page.evaluate("[segsplat.state.scene.id, segsplat.drawing.count]") == [splats, 40]
