@@ -1,6 +1,7 @@
 //! Fusion: a surface that many photos show is kept from a few of them.
 //!
-//! Photos are taken one after another, the surest first. A Gaussian is dropped where at least
+//! First what hides the surfaces of many other photos is dropped ([`FreeSpace`]). Then photos are
+//! taken one after another, the surest first. A Gaussian is dropped where at least
 //! [`FuseOptions::layers`] photos before it *kept* a Gaussian of the same surface at that place,
 //! no coarser than its own. So no hole opens, and a surface that sixty photos show has as many
 //! layers as a surface that a few photos show.
@@ -10,6 +11,7 @@ use std::sync::atomic::AtomicBool;
 use glam::DVec3;
 use rayon::prelude::*;
 
+use super::free_space::{FreeSpace, carve, neighbors};
 use crate::{
     error::Result,
     point,
@@ -28,11 +30,26 @@ pub struct FuseOptions {
     pub same_surface: f64,
     /// A coarser layer does not make a finer one superfluous: largest ratio of pixel footprints.
     pub footprint_ratio_max: f64,
+    /// What hides the surface that other photos see, in scenes of more photos than `layers`. A
+    /// network composes the views of a set, so only what much speaks against is dropped: chosen
+    /// on six scenes that are not reported, docs/adr/0100-free-space-of-layers.md.
+    pub free_space: FreeSpace,
 }
 
 impl Default for FuseOptions {
     fn default() -> Self {
-        Self { layers: 4, same_surface: 0.02, footprint_ratio_max: 1.2 }
+        Self {
+            layers: 4,
+            same_surface: 0.02,
+            footprint_ratio_max: 1.2,
+            free_space: FreeSpace {
+                neighbors: 16,
+                same_surface: 0.03,
+                depth: 0.1,
+                parallax_px: 4.0,
+                against_max: 4.0,
+            },
+        }
     }
 }
 
@@ -89,6 +106,8 @@ pub(super) fn fuse(
     }
     let surfaces: Vec<Surface<'_>> =
         views.iter().zip(candidate).map(|(view, keep)| Surface::new(view, keep)).collect();
+    let near = neighbors(&surfaces, options.free_space.neighbors);
+    carve(&surfaces, &near, &mut fates, &options.free_space, cancel)?;
     let mut before: Vec<usize> = Vec::with_capacity(views.len());
     for v in surest_first(views) {
         unless_cancelled(cancel)?;

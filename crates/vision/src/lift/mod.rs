@@ -5,6 +5,7 @@
 //! which reason. Nothing is dropped uncounted.
 
 mod backdrop;
+mod free_space;
 mod fuse;
 mod thin;
 mod union;
@@ -20,7 +21,7 @@ use crate::{
     error::{Error, Result},
     lift::{
         fuse::{Fate, fuse},
-        union::{PIXELS_A_TASK, median, unite},
+        union::unite,
     },
     point,
     scene::{
@@ -29,6 +30,7 @@ use crate::{
     },
 };
 
+pub use free_space::FreeSpace;
 pub use fuse::FuseOptions;
 pub use thin::ThinOptions;
 pub use union::UnionOptions;
@@ -53,6 +55,9 @@ impl Default for Fusion {
 const DEPTH_SLACK: f64 = 2.0;
 /// How far beyond its own picture a Gaussian may lie, as a share of the picture's side.
 const FRAME_SLACK: f64 = 0.1;
+/// Pixels that one thread takes at a time.
+const PIXELS_A_TASK: usize = 1 << 11;
+
 /// A lifted scene.
 #[derive(Clone, Debug)]
 pub struct Lifted {
@@ -324,4 +329,13 @@ fn moved(
 fn center_of(cameras: &[Camera]) -> DVec3 {
     let sum: DVec3 = cameras.iter().map(|camera| camera.camera_to_world.center()).sum();
     if cameras.is_empty() { sum } else { sum / cameras.len() as f64 }
+}
+
+/// Median, 0 of nothing.
+fn median(mut values: Vec<f64>) -> f64 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }

@@ -1,10 +1,11 @@
-//! One set of Gaussians: what hides the surface that other photos see goes, and the surface stays.
+//! One set of Gaussians, and layers: what hides the surface that other photos see goes, and the
+//! surface stays.
 
 use std::sync::atomic::AtomicBool;
 
 use glam::DMat4;
 use segsplat_core::scene::{Camera, CameraToWorld, Intrinsics, ViewGaussians};
-use segsplat_vision::lift::{Fusion, Lifted, UnionOptions, lift};
+use segsplat_vision::lift::{FuseOptions, Fusion, Lifted, UnionOptions, lift};
 
 const SIDE: usize = 16;
 const FOCAL: f64 = 16.0;
@@ -42,13 +43,17 @@ fn view(photo: u16, depth: f32) -> ViewGaussians {
     }
 }
 
-/// Photos of the wall; in the third the middle stands at `depth`.
+/// Photos of the wall as one set; in the third the middle stands at `depth`.
 fn lifted(photos: u16, depth: f32) -> Lifted {
+    fused(photos, depth, &Fusion::OneSet(UnionOptions::default()))
+}
+
+fn fused(photos: u16, depth: f32, fusion: &Fusion) -> Lifted {
     let views: Vec<ViewGaussians> =
         (0..photos).map(|i| view(i, if i == 2 { depth } else { WALL })).collect();
     let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
     let go_on = AtomicBool::new(false);
-    lift(views, &cameras, true, &Fusion::OneSet(UnionOptions::default()), None, &go_on).unwrap()
+    lift(views, &cameras, true, fusion, None, &go_on).unwrap()
 }
 
 fn dropped(lifted: &Lifted, reason: &str) -> u64 {
@@ -65,6 +70,22 @@ fn what_stands_in_the_free_space_of_other_photos_is_dropped() {
     // Within the tolerance it is the wall; behind the wall it hides nothing.
     for depth in [WALL, 3.9, 6.0] {
         assert_eq!(dropped(&lifted(6, depth), "free_space"), 0, "{depth}");
+    }
+}
+
+#[test]
+fn of_layers_only_what_many_photos_see_through_is_dropped() {
+    let layers = |photos, depth| {
+        let mut options = FuseOptions::default();
+        options.free_space.parallax_px = 0.5; // these photos are small and near each other
+        dropped(&fused(photos, depth, &Fusion::Layers(options)), "free_space")
+    };
+    // Five against one are more than four times as many, four are not.
+    assert_eq!((layers(6, 2.0), layers(5, 2.0)), (16, 0));
+    assert_eq!(layers(4, 2.0), 0, "few photos stay as the network made them");
+    // By a tenth of the depth, not less; behind the wall it hides nothing.
+    for depth in [WALL, 3.7, 6.0] {
+        assert_eq!(layers(6, depth), 0, "{depth}");
     }
 }
 
