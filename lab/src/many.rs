@@ -23,7 +23,7 @@ use crate::{
     refine::{ALIGNING_STEPS, RefinedVersion, aligned, held_out},
     refinements::Variant,
     render::{
-        Background, DifferentiableRenderer, Frame, Kinds, RenderRequest, Renderer, Switches,
+        Background, Frame, Kinds, RenderRequest, Renderer, Switches,
         plan::{default_near, served},
         train::{pose::moved, unit},
     },

@@ -99,7 +99,9 @@ async fn gaussians_of(server: &TestServer, id: &SceneId, text: &str) -> u64 {
 async fn held_server() -> (TestServer, Arc<WallNetworks>) {
     let networks = Arc::new(WallNetworks::default());
     let given = Arc::clone(&networks);
-    let server = TestServer::with(|_, parts| {
+    let server = TestServer::with(|config, parts| {
+        // The photos that join go to the store as they come.
+        config.limits.upload_memory_bytes_max = 1_000;
         parts.scenes = given;
         parts.semantics = Arc::new(PhotoMeaning::default());
     });
