@@ -185,6 +185,10 @@ async function paired(list, photos, rows) {
   return [found, lost];
 }
 
+// Photos of more bytes than these are made smaller before they are sent, though the server takes
+// more: its networks look no closer.
+const WHOLE_MAX = 256 * 2 ** 20;
+
 // The photos as they are sent. An upload over the limit has some of them, evenly, and where that is
 // not enough all are made smaller; so are photos of too many pixels. None gets smaller than the
 // server keeps it.
@@ -193,19 +197,20 @@ async function fit(photos, mayShrink, notes, at = () => {}) {
     mb = (n) => `${(n / 1e6).toPrecision(2 + (n > 1e8))} MB`,
     before = bytes(photos),
     { limits } = await server.models(),
+    room = Math.min(limits.upload_bytes_max, WHOLE_MAX),
     most = limits.photos_max;
   let sent = photos;
-  if (before > limits.upload_bytes_max && photos.length > most) {
+  if (before > room && photos.length > most) {
     const step = (photos.length - 1) / Math.max(most - 1, 1);
     sent = Array.from({ length: most }, (_, i) => photos[Math.round(i * step)]);
     notes.push(t('photos.chosen', { all: photos.length, size: mb(before), sent: sent.length }));
   }
   if (!mayShrink) return sent;
-  const all = bytes(sent) > limits.upload_bytes_max,
+  const all = bytes(sent) > room,
     // What the server keeps of those that networks see, and what fits: half a byte a pixel.
     kept = Math.min(
       limits.photos_pixels_kept_max / Math.min(sent.length, limits.network_photos_max),
-      all ? (2 * limits.upload_bytes_max) / sent.length : Infinity,
+      all ? (2 * room) / sent.length : Infinity,
     ),
     fitted = [];
   let made = 0;

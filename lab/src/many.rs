@@ -18,12 +18,12 @@ use crate::{
     photo_files,
     pipeline::{
         Pipeline, growth, ignored,
-        refinement::{RefineCalls, at_side, refined},
+        refinement::{RefineCalls, refined},
     },
-    refine::{ALIGNING_STEPS, RefinedVersion, TRANSIENT_SIDE, aligned, held_out, transient},
+    refine::{ALIGNING_STEPS, RefinedVersion, aligned, held_out},
     refinements::Variant,
     render::{
-        Background, DifferentiableRenderer, Frame, Kinds, RenderRequest, Renderer, Switches,
+        Background, Frame, Kinds, RenderRequest, Renderer, Switches,
         plan::{default_near, served},
         train::{pose::moved, unit},
     },
@@ -176,7 +176,6 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
                 "ignore": args.ignore,
                 "ignored": ignored,
                 "ignore_ms": ignore_ms,
-                "transient": shown_alone(&*renderer, &scene, &first, &given, &pasted)?,
                 "peak_mib": peak_mib(),
             });
             if variants.is_empty() {
@@ -252,8 +251,6 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
                 row["steps"] = json!(found.report.steps);
                 row["overfit"] = json!(found.overfit);
                 row["pose_gain"] = json!(found.pose_gain);
-                row["transient_gain"] = json!(found.transient_gain);
-                row["left_out"] = json!(found.report.transient);
                 row["moved"] = json!(found.report.cameras);
                 row["held_out"] = json!(held_out(given.len()));
                 row["own_psnr_before"] = json!(found.report.psnr_before);
@@ -356,25 +353,6 @@ fn left_out(photos: &[PosedPhoto], pasted: &[Option<Vec<bool>>]) -> [f64; 2] {
         }
     }
     counts.map(|[all, out]| out as f64 / all.max(1) as f64)
-}
-
-/// The same of what photos show alone before the first step.
-fn shown_alone(
-    renderer: &dyn DifferentiableRenderer,
-    scene: &Scene,
-    gaussians: &Gaussians,
-    photos: &[PosedPhoto],
-    pasted: &[Option<Vec<bool>>],
-) -> Result<[f64; 2]> {
-    let small: Vec<PosedPhoto> =
-        photos.iter().map(|posed| at_side(posed, TRANSIENT_SIDE)).collect();
-    let maps = transient(renderer, scene, gaussians, &small)?;
-    let mut photos = photos.to_vec();
-    photos.iter_mut().zip(&maps).for_each(|(posed, map)| {
-        posed.photo.valid = None;
-        posed.photo.leave_out(map);
-    });
-    Ok(left_out(&photos, pasted))
 }
 
 fn poses_of(photos: &[PosedPhoto]) -> Vec<CameraToWorld> {

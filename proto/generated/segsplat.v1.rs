@@ -901,10 +901,6 @@ pub struct RefineReport {
     /// Photos that were learnt beside those of the scene: the networks did not see them.
     #[prost(uint32, tag = "10")]
     pub more_photos: u32,
-    /// Share of each photo that took no part, in the order of the cameras: it shows what the other
-    /// photos do not. None where nothing is left out for that.
-    #[prost(double, repeated, tag = "11")]
-    pub transient: ::prost::alloc::vec::Vec<f64>,
 }
 /// How far a camera is from where it was given.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]

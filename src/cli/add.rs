@@ -1,6 +1,6 @@
 //! `segsplat add`: photos of a folder or an archive join a scene of a running server.
 
-use std::{collections::BTreeMap, path::PathBuf, time::Duration};
+use std::{borrow::Cow, collections::BTreeMap, path::PathBuf, time::Duration};
 
 use reqwest::{Client, RequestBuilder, Url, header};
 use serde_json::Value;
@@ -61,11 +61,13 @@ fn form(args: &Args, limits: &Limits) -> Result<Body> {
     let (found, cameras) = find_in_dir(&args.photos, &limits)?;
     let mut files = BTreeMap::new();
     for photo in &found.photos {
-        files.insert(&*photo.path, &*photo.bytes);
+        files.insert(&*photo.path, photo.bytes.read()?);
         // Several photos may have one mask.
-        files.extend(photo.mask.iter().map(|mask| (&*mask.path, &*mask.bytes)));
+        if let Some(mask) = &photo.mask {
+            files.insert(&*mask.path, mask.bytes.read()?);
+        }
     }
-    files.extend(cameras.iter().map(|file| (&*file.name, &*file.bytes)));
+    files.extend(cameras.iter().map(|file| (&*file.name, Cow::from(&file.bytes))));
     let all: Vec<u8> = files.values().flat_map(|bytes| sha256(bytes).into_bytes()).collect();
     // No file holds the hash of all of them.
     let boundary = sha256(&all);
@@ -77,7 +79,7 @@ fn form(args: &Args, limits: &Limits) -> Result<Body> {
              filename=\"{name}\"\r\n\r\n"
         );
         bytes.extend(head.into_bytes());
-        bytes.extend(file);
+        bytes.extend_from_slice(&file);
         bytes.extend(b"\r\n");
     }
     bytes.extend(format!("--{boundary}--\r\n").into_bytes());

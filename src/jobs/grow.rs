@@ -147,7 +147,7 @@ impl Jobs {
     ) -> Result<bool> {
         let record = self.record(id)?;
         let (limits, there) = (self.parts.limits.get(), record.photos_to_be());
-        let reading = limits_beside(&limits, upload.photos.len().max(1), there.len());
+        let reading = limits_beside(&limits, upload.sent().count().max(1), there.len());
         let (photos, hashes) = read_joining(&upload, &reading, &AtomicBool::new(false))?;
         let request_sha256 = store::request_sha256(&hashes, &SceneOptions::default());
         if let Some(replayed) = replayed(&record, idempotency_key.as_deref(), &request_sha256)? {
@@ -161,7 +161,11 @@ impl Jobs {
         if all > limits.network_photos_max {
             return Err(Error::limit("photos of the scene", all, limits.network_photos_max));
         }
-        let object = Store::added_name()?;
+        // Files that are in the store already are listed by it.
+        let object = match &upload.kept {
+            Some(kept) => kept.list.clone(),
+            None => Store::added_name()?,
+        };
         let added = AddedPhotos { object, files, idempotency_key, request_sha256 };
         self.parts.store.has_room()?;
         let mut waiting = (*record).clone();

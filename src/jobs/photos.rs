@@ -46,14 +46,15 @@ impl ReadUpload {
         limits: &Limits,
         cancel: &AtomicBool,
     ) -> Result<Self> {
-        let read = || match &upload.splats {
+        let read = || match upload.sent_splats() {
             None => Ok(match pipeline::read(upload, options.cameras, limits, cancel)? {
                 ReadSet::Posed(photos) => Content::Photos(photos),
                 ReadSet::Unposed(photos) => Content::Unposed(photos),
             }),
             Some(file) => {
                 let begun = Instant::now();
-                let read = read_splats(&mut &file.bytes[..], &file.name, limits)?;
+                let bytes = file.bytes.read()?;
+                let read = read_splats(&mut &bytes[..], file.name, limits)?;
                 let mut scene = read.into_scene(options)?;
                 let ms = begun.elapsed().as_secs_f64() * 1e3;
                 let stage = Stage::Photos.name().to_owned();

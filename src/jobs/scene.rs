@@ -150,7 +150,7 @@ impl Jobs {
             Some(upload) => (upload.files.clone(), upload.is_of_photos()),
             None => {
                 let upload = store.upload(id)?;
-                (store::hashes(&upload), upload.splats.is_none())
+                (store::hashes(&upload), upload.sent_splats().is_none())
             }
         };
         let networks = if of_photos { self.parts.scenes.identity() } else { String::new() };

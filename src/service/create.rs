@@ -17,7 +17,7 @@ use crate::{
     keys::Caller,
     limits::IDEMPOTENCY_KEY_BYTES_MAX,
     scene::{SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, Upload},
-    store::{self, Record},
+    store::{self, Receiving, Record, Store, UPLOAD},
     telemetry,
 };
 
@@ -68,7 +68,8 @@ impl Service {
         if options.semantics == SemanticsMode::Eager {
             self.inner.can_understand("semantics=eager")?;
         }
-        let needs_photos = options.semantics == SemanticsMode::Lazy && upload.splats.is_none();
+        let needs_photos =
+            options.semantics == SemanticsMode::Lazy && upload.sent_splats().is_none();
         if needs_photos && !self.inner.config.keep_photos {
             // Without photos there is no later.
             let can = self.inner.can_understand("semantics").is_ok();
@@ -76,7 +77,7 @@ impl Service {
         }
         let keyed = idempotency_key.is_some();
         self.has_room(keyed)?;
-        self.inner.memory.admit(upload.size_bytes())?;
+        self.inner.memory.admit(upload.memory_bytes())?;
         let one_at_a_time = match &idempotency_key {
             Some(key) => Some(self.inner.key_lock(key).lock().await),
             None => None,
@@ -92,6 +93,19 @@ impl Service {
             waited?;
         }
         Ok(Created { status: self.get(&id).await?, replayed })
+    }
+
+    /// Files of an upload that go to the store as they come: of a new scene, or of photos that join
+    /// one.
+    ///
+    /// # Errors
+    /// `store_unavailable`.
+    pub(crate) async fn receiving(&self, joined: Option<&SceneId>) -> Result<Receiving> {
+        let (scene, list) = match joined {
+            Some(id) => (id.clone(), Store::added_name()?),
+            None => (store::new_id()?, UPLOAD.to_owned()),
+        };
+        Receiving::begin(&self.inner.store, scene, list).await
     }
 
     /// Refuses a create that would find the queue full, before its photos are sent or decoded. A
@@ -145,14 +159,18 @@ impl Shared {
         record: impl FnOnce(Record) -> Record,
         caller: &Caller,
     ) -> Result<(SceneId, bool)> {
-        let id = store::new_id()?;
+        // Files that are in the store already lie beside it.
+        let id = match &upload.kept {
+            Some(kept) => kept.scene.clone(),
+            None => store::new_id()?,
+        };
         let status = SceneStatus::new(id.clone(), SceneState::Queued, store::now_ms());
         let record = record(Record {
             owner: caller.owner().map(str::to_owned),
             traceparent: telemetry::traceparent(),
             ..Record::new(status)
         });
-        let photos = upload.photos.len();
+        let photos = upload.sent().count();
         let queued = self.jobs.submit(upload, record)?;
         let replayed = queued != id;
         if !replayed {

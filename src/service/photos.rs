@@ -24,7 +24,7 @@ impl Service {
         let AddPhotos { upload, idempotency_key, wait } = request;
         check_key(idempotency_key.as_deref())?;
         let scene = self.scene_of_photos(id).await?;
-        self.inner.memory.admit(upload.size_bytes())?;
+        self.inner.memory.admit(upload.memory_bytes())?;
         let one_at_a_time = match &idempotency_key {
             Some(key) => Some(self.inner.key_lock(key).lock().await),
             None => None,

@@ -5,7 +5,9 @@
 
 use std::sync::Arc;
 
-use super::{Growth, PhotoChange, Record, SEMANTICS, Store, new_id, now_ms, of, upload_file};
+use super::{
+    Growth, PhotoChange, Record, SEMANTICS, Store, new_id, now_ms, of, received, upload_file,
+};
 use crate::{
     error::{Error, ErrorCode, Result},
     formats::container::write_semantics,
@@ -28,6 +30,9 @@ impl Store {
     /// Fails with `store_unavailable`; `scene_not_found` when the scene was deleted.
     pub(crate) fn put_added(&self, object: &str, upload: Upload, record: &Record) -> Result<()> {
         let id = &record.status.id;
+        self.check_received(upload.kept.as_ref())?;
+        // Its files are removed where nobody has them and there is no list of them.
+        let _kept = upload.kept.clone();
         let file = upload_file::pack(upload, record)
             .map_err(|e| Error::internal("the photos cannot be packed").caused_by(e))?;
         self.objects.offer("keep the photos", of(id, object), file)?;
@@ -40,12 +45,13 @@ impl Store {
         let file = self.objects.get("read the photos", of(id, object))?;
         let gone =
             || Error::new(ErrorCode::SceneCorrupt, format!("{object} of scene {id} is gone"));
-        Ok(upload_file::read(&file.ok_or_else(gone)?)?.0)
+        Ok(upload_file::read(&file.ok_or_else(gone)?, &self.objects, id, object)?.0)
     }
 
     /// Forgets photos that do not join their scene after all.
     pub(crate) fn drop_added(&self, id: &SceneId, object: &str) -> Result<()> {
-        self.objects.delete("forget the photos", of(id, object)).map(drop)
+        self.objects.delete("forget the photos", of(id, object))?;
+        self.drop_files(id, object)
     }
 
     /// Keeps a version of a finished scene whose photos are others, with the semantics of all of
@@ -73,11 +79,13 @@ impl Store {
         let (mut growth, id) = (Growth::default(), &scene.id);
         let objects = self.objects.list("read the scene", &format!("scenes/{id}"))?;
         let names = objects.iter().filter_map(|object| object.path.filename());
-        let mut names: Vec<&str> = names.filter(|name| name.starts_with(ADDED)).collect();
+        let is_list = |name: &&str| name.starts_with(ADDED) && received::is_list(name);
+        let mut names: Vec<&str> = names.filter(is_list).collect();
         names.sort_unstable();
         for name in names {
             let file = self.objects.get("read the photos", of(id, name))?;
-            let Some(Ok((_, record))) = file.map(|file| upload_file::read(&file)) else { continue };
+            let read = file.map(|file| upload_file::read(&file, &self.objects, id, name));
+            let Some(Ok((_, record))) = read else { continue };
             let Some(PhotoChange::Add(added)) = record.growth.waiting.back().cloned() else {
                 continue;
             };

@@ -3,6 +3,7 @@
 //! ```text
 //! scenes/ID/upload.segsplat     photos and cameras as sent, with the first record
 //! scenes/ID/added-*.segsplat    photos that joined it later, with the record before they did
+//! scenes/ID/upload-* added-*-*  files of these two that went to the store as they came
 //! scenes/ID/scene.segsplat      the finished scene
 //! scenes/ID/semantics.segsplat  its semantics, once a text needed them
 //! scenes/ID/edits.json          its list of edits, once there was one
@@ -25,6 +26,7 @@ mod hashes;
 mod index;
 mod objects;
 mod open;
+mod received;
 mod record;
 mod shared;
 mod sweep;
@@ -43,6 +45,7 @@ use parking_lot::Mutex;
 
 pub(crate) use self::hashes::is_of_request;
 use self::objects::Objects;
+pub(crate) use self::received::Receiving;
 pub use self::{
     files::sha256,
     hashes::{provenance, request_sha256},
@@ -58,7 +61,8 @@ use crate::{
     scene::{Scene, SceneId, Semantics, Upload},
 };
 
-const UPLOAD: &str = "upload.segsplat";
+/// Name of the object with the upload that a scene is made of.
+pub(crate) const UPLOAD: &str = "upload.segsplat";
 const STATUS: &str = "status.json";
 const EDITS: &str = "edits.json";
 const SCENE: &str = "scene.segsplat";
@@ -69,7 +73,7 @@ const QUARANTINED: &str = "quarantined";
 /// The scenes of one folder or bucket. Calls block on it; all are safe from any thread.
 #[derive(Debug)]
 pub struct Store {
-    objects: Objects,
+    objects: Arc<Objects>,
     /// Whether other processes use the same objects.
     shared: bool,
     /// Finished scenes, by the bytes of their arrays.
@@ -78,6 +82,8 @@ pub struct Store {
     reading: Mutex<HashMap<SceneId, Arc<Mutex<()>>>>,
     /// Scenes whose upload and first record are being written: a sweep leaves them alone.
     arriving: Mutex<HashSet<SceneId>>,
+    /// Lists of the files of uploads that are being received: a sweep leaves these alone.
+    receiving: Mutex<HashSet<Name>>,
     /// Scenes deleted here: what a job still writes of one is removed again.
     gone: Mutex<HashMap<SceneId, Instant>>,
     /// Dropped with the store: another process may then use the folder.
@@ -160,6 +166,8 @@ impl Store {
     /// `store_unavailable`.
     pub fn put_upload(&self, upload: Upload, record: &Record) -> Result<()> {
         let id = &record.status.id;
+        // Its files are removed where nobody has them and there is no list of them.
+        let kept = upload.kept.clone();
         let keep = || -> Result<()> {
             let file = upload_file::pack(upload, record)
                 .map_err(|e| Error::internal("the upload cannot be packed").caused_by(e))?;
@@ -167,6 +175,7 @@ impl Store {
             if self.shared {
                 // The record first: the sweep of a replica removes an upload without one.
                 self.announce(record)?;
+                self.check_received(kept.as_ref())?;
                 return put();
             }
             self.arriving.lock().insert(id.clone());
@@ -188,12 +197,14 @@ impl Store {
     /// `scene_not_found` when it is not kept, `scene_corrupt`, `store_unavailable`.
     pub fn upload(&self, id: &SceneId) -> Result<Upload> {
         let file = self.objects.get("read the upload", of(id, UPLOAD))?;
-        Ok(upload_file::read(&file.ok_or_else(|| not_found(id))?)?.0)
+        let file = file.ok_or_else(|| not_found(id))?;
+        Ok(upload_file::read(&file, &self.objects, id, UPLOAD)?.0)
     }
 
     /// Forgets photos and cameras of a scene; what needs them can then not be made.
     pub(crate) fn drop_upload(&self, id: &SceneId) -> Result<()> {
-        self.objects.delete("forget the photos", of(id, UPLOAD)).map(drop)
+        self.objects.delete("forget the photos", of(id, UPLOAD))?;
+        self.drop_files(id, UPLOAD)
     }
 
     /// Keeps a newer record.

@@ -10,6 +10,7 @@
 use std::{
     collections::HashMap,
     future::Future,
+    ops::Range,
     path::{Path as FilePath, PathBuf},
     sync::{
         Arc,
@@ -23,13 +24,18 @@ use fs_err as fs;
 use futures_util::{StreamExt, TryStreamExt, stream};
 use object_store::{
     Error as Fault, ObjectMeta, ObjectStore, ObjectStoreExt, PutMode, PutOptions, PutPayload,
-    path::Path,
+    buffered::BufWriter, path::Path,
 };
 use parking_lot::Mutex;
-use tokio::runtime::Runtime;
+use tokio::{
+    io::AsyncWriteExt,
+    runtime::{Handle, Runtime},
+};
 
 use crate::error::{Error, ErrorCode, Result};
 
+/// Bytes of an object that is received which go to the store in one part.
+const PART_BYTES: usize = 8 << 20;
 /// Calls to the store at the same time where many objects are read at once.
 const AT_ONCE: usize = 16;
 /// What a probe puts, as often as its size asks for.
@@ -278,6 +284,29 @@ impl Objects {
         self.run(what, |store| whole(store, path))
     }
 
+    /// Some bytes of an object; `None` where there is none.
+    pub(super) fn get_range(
+        &self,
+        what: &str,
+        path: Path,
+        range: Range<u64>,
+    ) -> Result<Option<Vec<u8>>> {
+        self.run(what, |store| async move {
+            Ok(found(store.get_range(&path, range).await)?.map(Vec::from))
+        })
+    }
+
+    /// An object that is put as its bytes come. It is there at its end, or not at all.
+    pub(super) fn writer(&self, what: &'static str, path: Path) -> Result<Writer> {
+        self.unless_moved(what)?;
+        let runtime = self.runtime.as_ref().map(|runtime| runtime.handle().clone());
+        let runtime = runtime.ok_or_else(|| unavailable(what, fault("the store is closed")))?;
+        let writer = BufWriter::with_capacity(Arc::clone(&self.store), path, PART_BYTES);
+        // The part that is gathered and the one that goes out.
+        let writer = Some(writer.with_max_concurrency(1));
+        Ok(Writer { runtime, timeout: self.timeout, what, writer })
+    }
+
     /// The bytes of many objects, in their order.
     pub(super) fn get_all(&self, what: &str, paths: Vec<Path>) -> Result<Vec<Option<Vec<u8>>>> {
         self.run(what, |store| {
@@ -329,6 +358,71 @@ impl Objects {
             };
             store.list(Some(&prefix)).map_ok(listed).try_collect().await
         })
+    }
+}
+
+/// An object that is being put.
+pub(super) struct Writer {
+    runtime: Handle,
+    timeout: Duration,
+    what: &'static str,
+    /// None once a call failed.
+    writer: Option<BufWriter>,
+}
+
+impl Writer {
+    /// Bytes that it takes in memory.
+    pub(super) const BYTES: usize = 2 * PART_BYTES;
+
+    /// The next bytes.
+    pub(super) async fn put(&mut self, bytes: Vec<u8>) -> Result<()> {
+        let mut writer = self.take()?;
+        let put = async move {
+            match writer.put(bytes.into()).await {
+                Ok(()) => Ok(writer),
+                Err(fault) => {
+                    // What is there of it goes; the first fault is told.
+                    let _ = writer.abort().await;
+                    Err(fault)
+                }
+            }
+        };
+        self.writer = Some(call(self.how(), put).await?);
+        Ok(())
+    }
+
+    /// The object is there, and stays, on return.
+    pub(super) async fn end(&mut self) -> Result<()> {
+        let mut writer = self.take()?;
+        call(self.how(), async move { writer.shutdown().await.map_err(fault) }).await
+    }
+
+    fn how(&self) -> (Handle, Duration, &'static str) {
+        (self.runtime.clone(), self.timeout, self.what)
+    }
+
+    fn take(&mut self) -> Result<BufWriter> {
+        let lost = || unavailable(self.what, fault("bytes before these were not kept"));
+        self.writer.take().ok_or_else(lost)
+    }
+}
+
+/// One call of a writer on the store's own threads.
+async fn call<T: Send + 'static>(
+    (runtime, timeout, what): (Handle, Duration, &'static str),
+    call: impl Future<Output = Result<T, Fault>> + Send + 'static,
+) -> Result<T> {
+    let late = |_| Err(fault(std::io::Error::from(std::io::ErrorKind::TimedOut)));
+    let call = async move { tokio::time::timeout(timeout, call).await.unwrap_or_else(late) };
+    let done = runtime.spawn(call).await;
+    done.unwrap_or_else(|e| Err(fault(e))).map_err(|fault| unavailable(what, fault))
+}
+
+impl Drop for Writer {
+    fn drop(&mut self) {
+        if let Some(mut writer) = self.writer.take() {
+            self.runtime.spawn(async move { writer.abort().await });
+        }
     }
 }
 

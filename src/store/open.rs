@@ -115,11 +115,12 @@ impl Store {
             }
         };
         let store = Self {
-            objects,
+            objects: Arc::new(objects),
             shared,
             cache: Cache::new(limits.cache_bytes_max),
             reading: Mutex::default(),
             arriving: Mutex::default(),
+            receiving: Mutex::default(),
             gone: Mutex::default(),
             _lock: lock,
         };
@@ -300,6 +301,7 @@ fn from_upload(store: &Store, id: &SceneId) -> Result<Option<Record>> {
 /// The record that the upload was kept with.
 fn first_record(store: &Store, id: &SceneId) -> Result<Option<Record>> {
     let Some(file) = store.objects.get("read the upload", of(id, UPLOAD))? else { return Ok(None) };
-    let record = upload_file::read(&file).ok().map(|(_, record)| record);
+    let read = upload_file::read(&file, &store.objects, id, UPLOAD);
+    let record = read.ok().map(|(_, record)| record);
     Ok(record.filter(|record| record.status.id == *id))
 }

@@ -1,12 +1,16 @@
 //! Removing objects that belong to no scene: a kill between two writes leaves them.
 //!
+//! Files that an upload put as they came go without its list, which is put last.
+//!
 //! Safe beside callers and other replicas. A scene's record is there before anything else of it,
 //! or the scene is known to arrive here. Its record goes first, and its status is there before its
 //! pending record goes. So an id that has neither, looked for in that order, is no scene.
 
 use std::{collections::HashSet, time::Duration};
 
-use super::{STATUS, Store, of, pending};
+use object_store::path::Path as Name;
+
+use super::{STATUS, Store, of, pending, received};
 use crate::{error::Result, scene::SceneId};
 
 /// What a sweep is, in an error.
@@ -22,10 +26,23 @@ impl Store {
         let mut removed = self.bury(buried)?;
         let known = self.stamps()?;
         let mut orphans = Vec::new();
-        for object in self.objects.list(SWEEP, "scenes")? {
+        let objects = self.objects.list(SWEEP, "scenes")?;
+        let all: HashSet<Name> = objects.iter().map(|object| object.path.clone()).collect();
+        for object in objects {
             let id = object.path.parts().nth(1).and_then(|part| part.as_ref().parse().ok());
             // What is named otherwise is not ours.
-            orphans.extend(id.map(|id: SceneId| (id, object)));
+            let Some(id): Option<SceneId> = id else { continue };
+            let list = object.path.filename().and_then(received::list_of);
+            match list.filter(|list| !all.contains(&of(&id, list))) {
+                None => orphans.push((id, object)),
+                Some(list) if self.may_be_received(&id, &list, object.age) => {}
+                // The list may have come since.
+                Some(list) if self.objects.exists(SWEEP, of(&id, &list))? => {}
+                Some(_) => {
+                    self.objects.delete(SWEEP, object.path)?;
+                    removed += 1;
+                }
+            }
         }
         let claims = self.objects.list(SWEEP, "claims")?;
         for object in claims.into_iter().chain(self.objects.list(SWEEP, "growing")?) {

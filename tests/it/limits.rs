@@ -65,11 +65,12 @@ enum Ask {
 }
 
 /// Limits, a value of each that changes the answer, and what is asked.
-const LIVE: [(&str, u64, Ask); 37] = [
+const LIVE: [(&str, u64, Ask); 38] = [
     ("photos_max", 2, Ask::Photos),
     ("network_photos_max", 2, Ask::Photos),
     ("photos_min", 4, Ask::Photos),
     ("upload_bytes_max", 1_000, Ask::Photos),
+    ("upload_file_bytes_max", 1_000, Ask::Photos),
     ("json_values_max", 3, Ask::Photos),
     ("photo_pixels_max", 100, Ask::Photos),
     ("photo_side_kept_max", 32, Ask::Photos),
@@ -106,9 +107,10 @@ const LIVE: [(&str, u64, Ask); 37] = [
 ];
 
 /// Live as well, and not seen by these calls: those of keys, in `access.rs`, and of answers that
-/// are not sent yet, in `answers.rs`; one that counts on a device alone, and those of threads and
+/// are not sent yet, in `answers.rs`, of memory, in `received.rs`; one that counts on a device alone, and those of threads and
 /// of replicas, by tests of their own below.
-const ELSEWHERE: [&str; 9] = [
+const ELSEWHERE: [&str; 10] = [
+    "upload_memory_bytes_max",
     "answers_bytes_max",
     "exports_bytes_max",
     "key_requests_per_s",

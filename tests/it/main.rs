@@ -41,6 +41,7 @@ mod offline;
 mod paper;
 mod proto;
 mod raw;
+mod received;
 mod refine;
 mod schedule;
 mod slow_callers;

@@ -106,6 +106,7 @@ fn upload() -> Upload {
         photos: vec![photo("../../a.png", &[1, 2, 3]), photo("b", &[])],
         archive: Some(vec![9; 1000]),
         splats: Some(photo("a.splat", &[7; 32])),
+        kept: None,
     }
 }
 

@@ -113,7 +113,7 @@ async fn a_scene_that_is_not_made_waits_for_the_version_that_reads_its_photos() 
     drop(store);
     let file = folder.path().join("scenes").join(id.as_str()).join("upload.segsplat");
     let ours = fs::read(&file).unwrap();
-    let other = reheaded(&ours, |header| header["__metadata__"]["version"] = "2".into());
+    let other = reheaded(&ours, |header| header["__metadata__"]["version"] = "3".into());
     fs::write(&file, &other).unwrap();
     // Oftener than a job may be begun.
     for _ in 0..4 {
@@ -121,7 +121,7 @@ async fn a_scene_that_is_not_made_waits_for_the_version_that_reads_its_photos() 
         let status = server.finished(&id).await;
         let error = status.error.expect("why it is not made");
         assert_eq!((status.state, error.code.as_str()), (SceneState::Failed, "other_version"));
-        assert!(error.message.contains("segsplat-upload version 2"), "{error:?}");
+        assert!(error.message.contains("segsplat-upload version 3"), "{error:?}");
         server.stop().await;
         assert!(fs::read(&file).unwrap() == other, "its photos are left as they are");
     }

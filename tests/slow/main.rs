@@ -17,6 +17,7 @@ mod grow_kill;
 mod grow_stream;
 mod kill;
 mod load;
+mod many_uploads;
 mod refine_kill;
 mod replicas;
 mod sample;

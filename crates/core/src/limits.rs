@@ -79,9 +79,15 @@ limits! {
     network_photos_max: usize = 64;
     /// Fewest photos that give parallax.
     photos_min: usize = 2;
-    /// Bytes of one upload, all parts together.
-    upload_bytes_max: usize = 256 << 20;
-    /// Bytes of all uploads being received; one more byte is refused as `overloaded`.
+    /// Bytes of one upload, all parts together: 1,000 photos of 12 megapixels have some 5 GB.
+    upload_bytes_max: usize = 8 << 30;
+    /// Bytes of one file of an upload but its archive, and of one file in an archive or a folder:
+    /// what is in memory while it is read.
+    upload_file_bytes_max: usize = 256 << 20;
+    /// Bytes of one upload that stay in memory while it is received. What comes after them goes to
+    /// the store as it comes, each file as an object of its own.
+    upload_memory_bytes_max: usize = 32 << 20;
+    /// Bytes in memory of all uploads being received; one more byte is refused as `overloaded`.
     uploads_bytes_max: usize = 1 << 30, restart;
     /// Bytes of one JSON part (`transforms`, `cameras`) or JSON body.
     json_bytes_max: usize = 8 << 20, restart;
@@ -103,8 +109,9 @@ limits! {
     /// Bytes of one file of cameras that is no JSON: COLMAP's `images.bin` has 24 bytes for each
     /// feature, 200 kB a photo.
     camera_file_bytes_max: usize = 128 << 20;
-    /// Bytes of one archive unpacked: what a zip bomb meets.
-    archive_unpacked_bytes_max: u64 = 512 << 20;
+    /// Bytes of one archive unpacked, one file at a time. Over 512 MiB they may be four times those
+    /// of the archive: what a zip bomb meets.
+    archive_unpacked_bytes_max: u64 = 8 << 30;
     /// Length of a photo's file name in bytes.
     file_name_bytes_max: usize = 256;
     /// Width or height of a rendered view in pixels.

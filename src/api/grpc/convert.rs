@@ -138,7 +138,7 @@ fn refine_report(report: RefineReport) -> pb::RefineReport {
     message!(RefineReport from report
         {
             steps, seconds, held_out, psnr_before, psnr_after, gaussians_before, gaussians_after,
-            left_out, more_photos, transient
+            left_out, more_photos
         }
         cameras: report.cameras.into_iter().map(moved).collect(),
     )

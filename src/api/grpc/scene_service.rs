@@ -260,18 +260,19 @@ async fn create(
 async fn add_photos(api: Api, mut messages: Streaming<pb::AddPhotosRequest>) -> Result<pb::Scene> {
     use pb::add_photos_header::Cameras;
     let limits = api.service.limits();
-    let mut upload = UploadBuilder::new(&limits, &api.uploads).at_least(1);
     let mut header = read_header(&mut messages).await?;
     // Before the photos are sent.
     let id: SceneId = header.scene_id.parse()?;
     api.service.get(&id).await?;
+    let upload = UploadBuilder::new(&limits, &api.uploads).at_least(1);
+    let mut upload = upload.kept_by(&api.service, Some(id.clone()));
     let cameras = header.cameras.take().map(|cameras| match cameras {
         Cameras::TransformsJson(json) => UploadCameras::Transforms(json.into()),
         Cameras::CamerasJson(json) => UploadCameras::Cameras(json.into()),
     });
     cameras.map_or(Ok(()), |cameras| upload.begin_cameras(cameras))?;
     read_pieces(&mut messages, &mut upload).await?;
-    let (upload, _guard) = upload.finish()?;
+    let (upload, _guard) = upload.finish().await?;
     let request = AddPhotos {
         upload,
         idempotency_key: not_empty(header.idempotency_key),
@@ -285,12 +286,12 @@ async fn read_upload(
     mut messages: Streaming<pb::CreateSceneRequest>,
 ) -> Result<(Upload, pb::CreateSceneHeader, UploadGuard)> {
     let limits = api.service.limits();
-    let mut upload = UploadBuilder::new(&limits, &api.uploads);
+    let mut upload = UploadBuilder::new(&limits, &api.uploads).kept_by(&api.service, None);
     let first = read_header(&mut messages).await?;
     api.service.has_room(!first.idempotency_key.is_empty())?;
     let header = begin(api, first, &mut upload)?;
     read_pieces(&mut messages, &mut upload).await?;
-    let (upload, guard) = upload.finish()?;
+    let (upload, guard) = upload.finish().await?;
     Ok((upload, header, guard))
 }
 
@@ -364,19 +365,19 @@ async fn read_pieces<M: UploadMessage>(
             UploadPart::Header(_) => return Err(Error::invalid("upload: a second header")),
             UploadPart::Photo(piece) => {
                 if !piece.name.is_empty() {
-                    upload.begin_photo(&piece.name)?;
+                    upload.begin_photo(&piece.name).await?;
                 }
-                upload.extend(&piece.data)?;
+                upload.extend(&piece.data).await?;
             }
             UploadPart::Splats(piece) => {
                 if !piece.name.is_empty() {
-                    upload.begin_splats(&piece.name)?;
+                    upload.begin_splats(&piece.name).await?;
                 }
-                upload.extend(&piece.data)?;
+                upload.extend(&piece.data).await?;
             }
             UploadPart::Archive(piece) => {
-                upload.begin_archive();
-                upload.extend(&piece)?;
+                upload.begin_archive().await?;
+                upload.extend(&piece).await?;
             }
         }
     }

@@ -22,7 +22,7 @@ use crate::{
     },
     error::{Error, Result, short},
     formats::captures::decoded_name,
-    scene::{SceneOptions, Upload, UploadCameras},
+    scene::{SceneId, SceneOptions, Upload, UploadCameras},
 };
 
 /// Bytes still read of an upload that was refused, so that the caller gets the answer.
@@ -90,15 +90,17 @@ enum Sent {
 pub(super) struct ArchiveBody(String);
 
 /// Reads the parts of `request`, or the archive that its body is; text parts that are options go to
-/// `fields`. So many photos must come at least.
+/// `fields`. So many photos must come at least; they may join a scene.
 pub(super) async fn read_upload(
     api: &Api,
     request: Request,
     fields: &mut Fields,
     photos_min: usize,
+    scene: Option<SceneId>,
 ) -> Result<(Upload, UploadGuard), ApiError> {
     let limits = &api.service.limits();
     let upload = UploadBuilder::new(limits, &api.uploads).at_least(photos_min);
+    let upload = upload.kept_by(&api.service, scene);
     let length = text_of(request.headers(), "content-length");
     let length = length.and_then(|value| value.parse::<usize>().ok());
     let has_room = api.service.has_room(request.headers().contains_key("idempotency-key"));
@@ -156,14 +158,14 @@ async fn archive(
     whole: Body,
     body: &WatchedBody,
 ) -> Result<(Upload, UploadGuard)> {
-    upload.begin_archive();
+    upload.begin_archive().await?;
     let mut pieces = whole.into_data_stream();
     while let Some(piece) = pieces.next().await {
         let piece = piece.map_err(|e| Error::invalid("upload: the body broke off").caused_by(e))?;
         body.progressed();
-        upload.extend(&piece)?;
+        upload.extend(&piece).await?;
     }
-    upload.finish()
+    upload.finish().await
 }
 
 async fn parts(
@@ -195,10 +197,10 @@ async fn parts(
                     continue;
                 }
                 upload.begin_cameras(UploadCameras::Cameras(Vec::new()))?;
-                upload.extend(&first)?;
+                upload.extend(&first).await?;
             }
-            "archive" => upload.begin_archive(),
-            "splats" => upload.begin_splats(field.file_name().unwrap_or_default())?,
+            "archive" => upload.begin_archive().await?,
+            "splats" => upload.begin_splats(field.file_name().unwrap_or_default()).await?,
             // More than a call may have say so by their number.
             "ignore" if words <= words_max => {
                 words += 1;
@@ -220,15 +222,15 @@ async fn parts(
                 let extended = disposition.and_then(|value| extended_name(value.as_bytes()));
                 let file = extended.as_deref().or_else(|| field.file_name());
                 let in_masks = file.filter(|_| name == MASKS).map(in_masks);
-                upload.begin_photo(&photo_name(&name, in_masks.as_deref().or(file))?)?;
+                upload.begin_photo(&photo_name(&name, in_masks.as_deref().or(file))?).await?;
             }
         }
         while let Some(piece) = field.chunk().await.map_err(broken)? {
             body.progressed();
-            upload.extend(&piece)?;
+            upload.extend(&piece).await?;
         }
     }
-    upload.finish()
+    upload.finish().await
 }
 
 /// A body, and the bytes since the last part began or went on. The reader of the form keeps bytes

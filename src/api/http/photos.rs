@@ -90,7 +90,7 @@ pub(super) async fn add(
         read_on(request.into_body().into_data_stream());
         return Err(error.into());
     }
-    let (upload, _guard) = read_upload(&api, request, &mut fields, 1).await?;
+    let (upload, _guard) = read_upload(&api, request, &mut fields, 1, Some(id.clone())).await?;
     let PhotosParams { wait_ms } = fields.take()?;
     fields.finish()?;
     let (wait, preferred) = wait_or(wait_ms.map(Duration::from_millis), preferred);

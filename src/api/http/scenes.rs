@@ -71,7 +71,7 @@ pub(super) async fn create(
     let request_id = request.headers().get(request_id::HEADER);
     let request_id = request_id.and_then(|id| id.to_str().ok()).map(str::to_owned);
     let least = api.service.limits().photos_min;
-    let (upload, _guard) = read_upload(&api, request, &mut fields, least).await?;
+    let (upload, _guard) = read_upload(&api, request, &mut fields, least, None).await?;
     let (options, wait) = options(&api, fields)?;
     let (wait, preferred) = wait_or(wait, preferred);
     let request = CreateScene { upload, options, idempotency_key, wait, request_id };

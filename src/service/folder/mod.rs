@@ -99,7 +99,7 @@ impl Pixels<'_> {
 
 impl FolderPixels for Pixels<'_> {
     fn photos(&mut self, put: &mut PutPhoto<'_>) -> Result<()> {
-        let Some(upload) = self.upload.filter(|upload| upload.splats.is_none()) else {
+        let Some(upload) = self.upload.filter(|upload| upload.sent_splats().is_none()) else {
             return Ok(());
         };
         let meta = &self.scene.meta;

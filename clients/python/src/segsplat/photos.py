@@ -14,6 +14,10 @@ from pathlib import Path
 from .types import CallerLimits
 from .wire import Part
 
+#: Photos of more bytes than these are made smaller before they are sent, though the server takes
+#: more: its networks look no closer.
+WHOLE_MAX = 256 << 20
+
 #: Width and height of a photo before it was made smaller, by its name.
 Sizes = dict[str, tuple[int, int]]
 
@@ -31,8 +35,8 @@ def fit(
     sent, before = list(photos), _bytes(photos)
     if not limits:
         return sent, {}
-    most = limits.photos_max
-    if before > limits.upload_bytes_max and len(sent) > most:
+    room, most = min(limits.upload_bytes_max, WHOLE_MAX), limits.photos_max
+    if before > room and len(sent) > most:
         step = (len(photos) - 1) / max(most - 1, 1)
         sent = [photos[round(i * step)] for i in range(most)]
         _tell(
@@ -41,12 +45,12 @@ def fit(
         )
     if not may_shrink:
         return sent, {}
-    every = _bytes(sent) > limits.upload_bytes_max
+    every = _bytes(sent) > room
     count = max(len(sent), 1)
     # What the server keeps of those that networks see, and what fits: half a byte a pixel.
     pixels = min(
         limits.photos_pixels_kept_max / min(count, limits.network_photos_max),
-        2 * limits.upload_bytes_max / count if every else math.inf,
+        2 * room / count if every else math.inf,
     )
     sizes: Sizes = {}
     fitted: list[Part] = []

@@ -353,9 +353,6 @@ class RefineReport:
     left_out: tuple[str, ...] = ()
     #: Photos that were learnt beside those of the scene: the networks did not see them.
     more_photos: int = 0
-    #: Share of each photo that took no part, for it shows what the others do not; empty where
-    #: nothing is left out for that.
-    transient: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -52,5 +52,8 @@ pub use semantics::{
 pub use sh::{SH_COUNT_MAX, ShRotation, sh_basis};
 pub use stage::{Stage, Watch, unless_cancelled};
 pub use status::{Event, SceneCamera, SceneState, SceneStatus, SemanticsState, SemanticsStatus};
-pub use upload::{Upload, UploadCameras, UploadFile};
+pub use upload::{
+    FilePart, KeptBytes, KeptFile, KeptFiles, SentBytes, SentFile, Upload, UploadCameras,
+    UploadFile,
+};
 pub use weights::PixelWeights;

@@ -149,10 +149,6 @@ pub struct RefineReport {
     /// Photos that took no part, by file name: their cameras cannot be right.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub left_out: Vec<String>,
-    /// Share of each photo that took no part, 0..1, in the order of the cameras: it shows what the
-    /// other photos do not, as somebody who walks by. Empty where nothing is left out for that.
-    #[serde(skip_serializing_if = "Vec::is_empty", default)]
-    pub transient: Vec<f64>,
 }
 
 /// How far a camera is from where it was given.

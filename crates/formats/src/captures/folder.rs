@@ -1,23 +1,27 @@
 //! The files of a capture wherever they are: in a folder, in a zip or tar, or as parts of a form.
 //!
-//! All names are known first; bytes are unpacked when they are asked for. Names are checked, and
-//! sizes are limited while bytes are read.
+//! All names are known first; bytes are unpacked when they are asked for, and those of photos not
+//! before they are decoded. Names are checked, and sizes are limited while bytes are read.
 
 use std::{
     borrow::Cow,
     cell::{Cell, RefCell},
     collections::BTreeMap,
-    io::{Cursor, Read},
+    io::Read,
     path::{Path, PathBuf},
+    sync::Arc,
 };
 
 use zip::{ZipReadOptions, read::OwnedZipFileEntry, unstable::read::ZipIterable};
 
-use super::names;
+use super::{
+    bytes::{FileBytes, SentReader, told_or},
+    names,
+};
 use crate::{
     error::{Error, Result, short},
     limits::Limits,
-    scene::UploadFile,
+    scene::{SentBytes, SentFile},
 };
 
 /// Folders in folders that are looked into.
@@ -33,6 +37,11 @@ const PACKED: [(&[u8], &str); 6] = [
     (b"Rar!", "RAR"),
 ];
 
+/// An archive may be so large unpacked, whatever its own size, and beyond that so many times as
+/// large as itself: photos are packed already.
+const UNPACKED_FREE: u64 = 512 << 20;
+const UNPACKED_TIMES: u64 = 4;
+
 /// Files by path, `/` between its parts.
 pub(crate) struct Folder<'a> {
     /// What it is in messages: `archive`, `upload`, or the path of a folder.
@@ -40,14 +49,15 @@ pub(crate) struct Folder<'a> {
     files: BTreeMap<String, Stored>,
     source: Source<'a>,
     pub(crate) limits: &'a Limits,
-    /// Bytes that were unpacked or read from a disk.
+    /// Bytes that were unpacked or read from a disk, and how many may be.
     unpacked: Cell<u64>,
+    unpacked_max: u64,
     /// Files of cameras that were read from a disk.
     cameras_read: RefCell<BTreeMap<String, Vec<u8>>>,
 }
 
 /// A file that was not read yet.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug)]
 struct Stored {
     /// Bytes as listed.
     size: u64,
@@ -55,11 +65,53 @@ struct Stored {
     at: usize,
 }
 
+#[derive(Clone)]
 enum Source<'a> {
-    Form(&'a [UploadFile]),
-    Tar(&'a [u8]),
-    Zip(&'a [u8], Vec<OwnedZipFileEntry>),
+    Form(Arc<[SentFile<'a>]>),
+    Tar(SentBytes<'a>),
+    Zip(SentBytes<'a>, Arc<Vec<OwnedZipFileEntry>>),
     Disk(PathBuf),
+}
+
+impl<'a> Source<'a> {
+    /// A file whole, not one byte more than the size that is listed. `what` is the folder.
+    fn read(&self, what: &str, path: &str, Stored { size, at }: Stored) -> Result<Cow<'a, [u8]>> {
+        let whole = |from: &mut dyn Read| -> Result<Cow<'a, [u8]>> {
+            let mut bytes = Vec::new();
+            from.take(size.saturating_add(1)).read_to_end(&mut bytes).map_err(|e| {
+                told_or(e, |e| {
+                    Error::photo(format!("{what}: {path:?} is damaged or cut short")).caused_by(e)
+                })
+            })?;
+            if bytes.len() as u64 > size {
+                return Err(Error::photo(format!(
+                    "{what}: {path:?} holds more than the {size} bytes that its header says"
+                )));
+            }
+            Ok(Cow::Owned(bytes))
+        };
+        match self {
+            Self::Form(sent) => sent[at].bytes.read(),
+            Self::Tar(bytes) => bytes.range(at as u64, size),
+            Self::Zip(bytes, entries) => {
+                let mut body = SentReader::new(*bytes);
+                let entry = entries[at].as_ref().with_reader(&mut body, ZipReadOptions::new());
+                let mut entry = entry.map_err(|e| {
+                    told_or(e, |e| {
+                        let why = "is damaged or packed in an unknown way";
+                        Error::photo(format!("archive: {path:?} {why}")).caused_by(e)
+                    })
+                })?;
+                whole(&mut entry)
+            }
+            Self::Disk(dir) => {
+                let mut file = fs_err::File::open(dir.join(path)).map_err(|e| {
+                    Error::photo(format!("folder: {path:?} cannot be read")).caused_by(e)
+                })?;
+                whole(&mut file)
+            }
+        }
+    }
 }
 
 impl<'a> Folder<'a> {
@@ -70,14 +122,15 @@ impl<'a> Folder<'a> {
     /// `invalid_request` for names that leave the folder or come twice, `limit_exceeded` for names
     /// that are too long.
     pub(crate) fn of_form(
-        sent: &'a [UploadFile],
+        sent: impl Iterator<Item = SentFile<'a>>,
         decoded: bool,
         limits: &'a Limits,
     ) -> Result<Self> {
-        let mut folder = Self::new("upload", Source::Form(sent), limits);
-        for (at, (file, path)) in sent.iter().zip(names::paths(sent, decoded, limits)?).enumerate()
-        {
-            folder.insert(path, Stored { size: file.bytes.len() as u64, at })?;
+        let sent: Arc<[SentFile<'a>]> = sent.collect();
+        let paths = names::paths(&sent, decoded, limits)?;
+        let mut folder = Self::new("upload", Source::Form(Arc::clone(&sent)), limits);
+        for (at, (file, path)) in sent.iter().zip(paths).enumerate() {
+            folder.insert(path, Stored { size: file.bytes.size(), at })?;
         }
         Ok(folder)
     }
@@ -87,12 +140,12 @@ impl<'a> Folder<'a> {
     /// # Errors
     /// `photo_unreadable` when it is no archive or damaged, `invalid_request` for names that leave
     /// it or links, `limit_exceeded` for too many entries or bytes.
-    pub(crate) fn of_archive(bytes: &'a [u8], limits: &'a Limits) -> Result<Self> {
-        match bytes {
+    pub(crate) fn of_archive(bytes: SentBytes<'a>, limits: &'a Limits) -> Result<Self> {
+        match &*bytes.range(0, 262)? {
             [b'P', b'K', ..] => Self::of_zip(bytes, limits),
-            _ if bytes.get(257..262) == Some(b"ustar") => Self::of_tar(bytes, limits),
-            _ => {
-                let known = PACKED.iter().find(|(start, _)| bytes.starts_with(start));
+            head if head.get(257..) == Some(b"ustar") => Self::of_tar(bytes, limits),
+            head => {
+                let known = PACKED.iter().find(|(start, _)| head.starts_with(start));
                 Err(Error::photo(match known {
                     Some((_, by)) => format!("archive: packed by {by}; send a zip or a plain tar"),
                     None => "archive: neither a zip nor a tar file".to_owned(),
@@ -101,16 +154,19 @@ impl<'a> Folder<'a> {
         }
     }
 
-    fn of_zip(bytes: &'a [u8], limits: &'a Limits) -> Result<Self> {
-        let damaged = |e| Error::photo("archive: the zip is damaged or cut short").caused_by(e);
+    fn of_zip(bytes: SentBytes<'a>, limits: &'a Limits) -> Result<Self> {
+        let damaged = |e| {
+            told_or(e, |e| Error::photo("archive: the zip is damaged or cut short").caused_by(e))
+        };
         // Unlike `ZipArchive` it reads no entry in `try_new`, so the number of entries, in ZIP64
         // too, is checked first. It also keeps entries that share a name.
         let config = zip::read::Config::default();
-        let mut zip = ZipIterable::try_new(Cursor::new(bytes), config).map_err(damaged)?;
+        let mut zip = ZipIterable::try_new(SentReader::new(bytes), config).map_err(damaged)?;
         if zip.len() > limits.archive_entries_max {
             return Err(Error::limit("archive: entries", zip.len(), limits.archive_entries_max));
         }
-        let mut folder = Self::new("archive", Source::Zip(bytes, Vec::new()), limits);
+        let mut folder = Self::new("archive", Source::Zip(bytes, Arc::default()), limits);
+        folder.unpacked_max = unpacked_max(bytes, limits);
         let (mut count, mut claimed_bytes, mut entries) = (0, 0_u64, Vec::new());
         for entry in zip.files().map_err(damaged)? {
             let entry = entry.map_err(damaged)?;
@@ -118,7 +174,7 @@ impl<'a> Folder<'a> {
             let kind = Kind { link: entry.is_symlink(), folder: entry.is_dir() };
             let path = entry_path(&mut count, name.as_bytes(), kind, limits)?;
             claimed_bytes = claimed_bytes.saturating_add(entry.size());
-            let max = limits.archive_unpacked_bytes_max;
+            let max = folder.unpacked_max;
             if claimed_bytes > max {
                 return Err(Error::limit("archive: unpacked bytes", claimed_bytes, max));
             }
@@ -129,17 +185,20 @@ impl<'a> Folder<'a> {
             folder.insert(path, Stored { size: entry.size(), at: entries.len() })?;
             entries.push(OwnedZipFileEntry::from(entry));
         }
-        folder.source = Source::Zip(bytes, entries);
+        folder.source = Source::Zip(bytes, Arc::new(entries));
         Ok(folder)
     }
 
-    fn of_tar(bytes: &'a [u8], limits: &'a Limits) -> Result<Self> {
+    fn of_tar(bytes: SentBytes<'a>, limits: &'a Limits) -> Result<Self> {
         use tar::EntryType;
 
-        let damaged = |e| Error::photo("archive: the tar is damaged or cut short").caused_by(e);
+        let damaged = |e| {
+            told_or(e, |e| Error::photo("archive: the tar is damaged or cut short").caused_by(e))
+        };
         let mut folder = Self::new("archive", Source::Tar(bytes), limits);
+        folder.unpacked_max = unpacked_max(bytes, limits);
         let mut count = 0;
-        let mut tar = tar::Archive::new(Cursor::new(bytes));
+        let mut tar = tar::Archive::new(SentReader::new(bytes));
         for entry in tar.entries_with_seek().map_err(damaged)? {
             let entry = entry.map_err(damaged)?;
             let kind = entry.header().entry_type();
@@ -152,11 +211,11 @@ impl<'a> Folder<'a> {
             let kind = Kind { link: !file && !is_folder, folder: is_folder };
             let Some(path) = entry_path(&mut count, &name, kind, limits)? else { continue };
             let (size, begin) = (entry.size(), entry.raw_file_position());
-            if size > limits.archive_unpacked_bytes_max {
-                return Err(over(&path, size, limits));
+            if size > folder.unpacked_max {
+                return Err(over(&path, size, folder.unpacked_max));
             }
             let end = begin.saturating_add(size);
-            let at = usize::try_from(begin).ok().filter(|_| end <= bytes.len() as u64);
+            let at = usize::try_from(begin).ok().filter(|_| end <= bytes.size());
             let at = at.ok_or_else(|| Error::photo(format!("archive: {path:?} is cut short")))?;
             folder.insert(path, Stored { size, at })?;
         }
@@ -171,6 +230,8 @@ impl<'a> Folder<'a> {
     pub(crate) fn of_dir(dir: &Path, limits: &'a Limits) -> Result<Self> {
         let what = dir.display().to_string();
         let mut folder = Self::new(what.as_str(), Source::Disk(dir.to_owned()), limits);
+        // Nothing is unpacked of a disk.
+        folder.unpacked_max = limits.archive_unpacked_bytes_max;
         let mut open = vec![(String::new(), 0)];
         while let Some((inside, depth)) = open.pop() {
             let unlisted =
@@ -206,6 +267,7 @@ impl<'a> Folder<'a> {
             source,
             limits,
             unpacked,
+            unpacked_max: u64::MAX,
             cameras_read: RefCell::default(),
         }
     }
@@ -284,35 +346,41 @@ impl<'a> Folder<'a> {
     /// A file whole.
     ///
     /// # Errors
-    /// `photo_unreadable` where it is damaged, `limit_exceeded` where all that was unpacked is too
-    /// large.
+    /// `photo_unreadable` where it is damaged, `limit_exceeded` where it, or all that was unpacked,
+    /// is too large.
     pub(crate) fn read(&self, path: &str) -> Result<Cow<'a, [u8]>> {
-        let Some(&Stored { size, at }) = self.files.get(path) else {
+        let stored = self.counted(path)?;
+        self.source.read(&self.what, path, stored)
+    }
+
+    /// A file that is read when its turn comes. It counts as read now.
+    ///
+    /// # Errors
+    /// As [`Self::read`], but for damage, which is found then.
+    pub(crate) fn later(&self, path: &str) -> Result<FileBytes<'a>> {
+        let stored = self.counted(path)?;
+        let (source, what, path) = (self.source.clone(), self.what.clone(), path.to_owned());
+        if let Source::Form(sent) = &source {
+            return Ok(FileBytes::from(sent[stored.at].bytes));
+        }
+        let read = move || source.read(&what, &path, stored);
+        Ok(FileBytes::later(stored.size, read))
+    }
+
+    /// A file whose size is within the limits, and of what is unpacked counted.
+    fn counted(&self, path: &str) -> Result<Stored> {
+        let Some(&stored) = self.files.get(path) else {
             return Err(Error::invalid(format!("{}: there is no {path:?}", self.what)));
         };
-        match &self.source {
-            Source::Form(sent) => Ok(Cow::Borrowed(&sent[at].bytes)),
-            Source::Tar(bytes) => {
-                self.count(path, size)?;
-                let len = usize::try_from(size).unwrap_or(usize::MAX);
-                Ok(Cow::Borrowed(&bytes[at..at.saturating_add(len)]))
-            }
-            Source::Zip(bytes, entries) => {
-                let mut body = Cursor::new(*bytes);
-                let entry = entries[at].as_ref();
-                let entry = entry.with_reader(&mut body, ZipReadOptions::new()).map_err(|e| {
-                    let why = "is damaged or packed in an unknown way";
-                    Error::photo(format!("archive: {path:?} {why}")).caused_by(e)
-                })?;
-                self.unpack(path, size, entry).map(Cow::Owned)
-            }
-            Source::Disk(dir) => {
-                let file = fs_err::File::open(dir.join(path)).map_err(|e| {
-                    Error::photo(format!("folder: {path:?} cannot be read")).caused_by(e)
-                })?;
-                self.unpack(path, size, file).map(Cow::Owned)
-            }
+        let max = self.limits.upload_file_bytes_max;
+        if stored.size > max as u64 {
+            let what = format!("{}: bytes of {path:?}", self.what);
+            return Err(Error::limit(what, stored.size, max));
         }
+        if !self.is_form() {
+            self.count(path, stored.size)?;
+        }
+        Ok(stored)
     }
 
     /// The first bytes of a file, at most `max`.
@@ -324,15 +392,14 @@ impl<'a> Folder<'a> {
             return Err(Error::invalid(format!("{}: there is no {path:?}", self.what)));
         };
         let size = size.min(max as u64);
-        let wanted = usize::try_from(size).unwrap_or(max);
         let mut head = Vec::new();
         let damaged = |e| Error::photo(format!("{}: {path:?} is damaged", self.what)).caused_by(e);
         match &self.source {
-            Source::Form(sent) => head.extend(sent[at].bytes.iter().take(wanted)),
-            Source::Tar(bytes) => head.extend(bytes[at..].iter().take(wanted)),
+            Source::Form(sent) => head.extend_from_slice(&sent[at].bytes.range(0, size)?),
+            Source::Tar(bytes) => head.extend_from_slice(&bytes.range(at as u64, size)?),
             Source::Zip(bytes, entries) => {
                 self.count(path, size)?;
-                let mut body = Cursor::new(*bytes);
+                let mut body = SentReader::new(*bytes);
                 let entry = entries[at].as_ref();
                 let entry = entry.with_reader(&mut body, ZipReadOptions::new());
                 let entry = entry.map_err(std::io::Error::other).map_err(damaged)?;
@@ -346,27 +413,10 @@ impl<'a> Folder<'a> {
         Ok(head)
     }
 
-    /// Reads one file whole. The size that is listed must be left of the limit. Not one byte more
-    /// is unpacked.
-    fn unpack(&self, path: &str, listed: u64, from: impl Read) -> Result<Vec<u8>> {
-        self.count(path, listed)?;
-        let what = &self.what;
-        let mut bytes = Vec::new();
-        from.take(listed.saturating_add(1)).read_to_end(&mut bytes).map_err(|e| {
-            Error::photo(format!("{what}: {path:?} is damaged or cut short")).caused_by(e)
-        })?;
-        if bytes.len() as u64 > listed {
-            return Err(Error::photo(format!(
-                "{what}: {path:?} holds more than the {listed} bytes that its header says"
-            )));
-        }
-        Ok(bytes)
-    }
-
     fn count(&self, path: &str, bytes: u64) -> Result<()> {
         let all = self.unpacked.get().saturating_add(bytes);
-        if all > self.limits.archive_unpacked_bytes_max {
-            return Err(over(path, all, self.limits));
+        if all > self.unpacked_max {
+            return Err(over(path, all, self.unpacked_max));
         }
         self.unpacked.set(all);
         Ok(())
@@ -380,8 +430,13 @@ fn is_read(head: &[u8]) -> bool {
     image::guess_format(head).is_ok_and(|format| matches!(format, Bmp | Jpeg | Png | WebP))
 }
 
-fn over(path: &str, bytes: u64, limits: &Limits) -> Error {
-    let max = limits.archive_unpacked_bytes_max;
+/// Bytes that an archive may have unpacked.
+fn unpacked_max(bytes: SentBytes<'_>, limits: &Limits) -> u64 {
+    let of_own = UNPACKED_FREE.max(UNPACKED_TIMES.saturating_mul(bytes.size()));
+    limits.archive_unpacked_bytes_max.min(of_own)
+}
+
+fn over(path: &str, bytes: u64, max: u64) -> Error {
     Error::limit(format!("archive: unpacked bytes at {path:?}"), bytes, max)
 }
 

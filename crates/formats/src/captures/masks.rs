@@ -9,9 +9,12 @@
 //! Folders of this name also hold labels of things, beside cameras of other programs. So the folder
 //! counts where COLMAP's cameras are read, and where a form has it, whose sender knows of it.
 
-use std::{borrow::Cow, collections::HashMap};
+use std::collections::HashMap;
 
-use super::names::{self, Spelling};
+use super::{
+    bytes::FileBytes,
+    names::{self, Spelling},
+};
 
 /// The file of a photo's mask.
 #[derive(Clone, Debug)]
@@ -19,7 +22,7 @@ pub struct FoundMask<'a> {
     /// The file as the folder calls it.
     pub path: String,
     /// The file.
-    pub bytes: Cow<'a, [u8]>,
+    pub bytes: FileBytes<'a>,
     /// Whether it marks what is left out: black takes part.
     pub marks_left_out: bool,
 }

@@ -10,6 +10,7 @@
 //! cameras without photo and photos without camera are warned of by name. Of more photos than a
 //! scene takes, the best are chosen.
 
+mod bytes;
 pub(crate) mod cameras;
 mod candidates;
 mod choose;
@@ -26,13 +27,13 @@ mod places;
 mod unposed;
 
 use std::{
-    borrow::Cow,
     collections::{BTreeMap, BTreeSet, HashMap, HashSet},
     path::Path,
 };
 
 use glam::DVec3;
 
+pub use self::bytes::FileBytes;
 pub use self::layouts::FIND_CAMERAS;
 pub use self::lens::{Base, Lens, LensAtSize, Sizes, Terms, same_aspect};
 pub use self::masks::FoundMask;
@@ -48,8 +49,8 @@ use crate::{
     error::{Error, Result},
     limits::Limits,
     scene::{
-        CameraToWorld, Upload, UploadCameras, UploadFile, Warning, WarningCode,
-        photo_label as label,
+        CameraToWorld, SentBytes, SentFile, Upload, UploadCameras, UploadFile, Warning,
+        WarningCode, photo_label as label,
     },
 };
 
@@ -73,8 +74,8 @@ pub fn find_in_dir<'a>(
     Ok((found, cameras.map(|(name, bytes)| UploadFile { name, bytes }).collect()))
 }
 
-/// The photos of an upload with their cameras, by what it holds. An archive is unpacked in memory
-/// under the limits.
+/// The photos of an upload with their cameras, by what it holds. An archive is unpacked
+/// a file at a time, under the limits.
 ///
 /// # Errors
 /// `invalid_request` for missing, surplus or impossible cameras, `photo_unreadable` for an archive
@@ -84,15 +85,15 @@ pub fn find<'a>(upload: &'a Upload, limits: &'a Limits) -> Result<FoundPhotos<'a
     if total > limits.upload_bytes_max {
         return Err(Error::limit("upload bytes", total, limits.upload_bytes_max));
     }
-    match (&upload.archive, &upload.cameras) {
-        (Some(_), cameras) if !upload.photos.is_empty() || cameras.is_some() => {
+    match (upload.sent_archive(), &upload.cameras) {
+        (Some(_), cameras) if upload.sent().next().is_some() || cameras.is_some() => {
             Err(Error::invalid("send either an archive or camera JSON and photos, not both"))
         }
         (Some(archive), _) => {
             of_folder(&Folder::of_archive(archive, limits)?, limits).map(|(found, _)| found)
         }
-        (None, Some(cameras)) => of_form(cameras, &upload.photos, limits),
-        (None, None) if upload.photos.iter().all(|file| names::is_photo(&file.name)) => {
+        (None, Some(cameras)) => of_form(cameras, upload.sent().collect(), limits),
+        (None, None) if upload.sent().all(|file| names::is_photo(file.name)) => {
             Err(Error::invalid(format!(
                 "upload: no camera description; send a part named transforms or cameras, the \
                  camera files of a capture, or an archive with them; {}",
@@ -100,9 +101,9 @@ pub fn find<'a>(upload: &'a Upload, limits: &'a Limits) -> Result<FoundPhotos<'a
             )))
         }
         (None, None) => {
-            let mut folder = Folder::of_form(&upload.photos, false, limits)?;
+            let mut folder = Folder::of_form(upload.sent(), false, limits)?;
             if layouts::find(&folder).is_empty() {
-                folder = Folder::of_form(&upload.photos, true, limits).unwrap_or(folder);
+                folder = Folder::of_form(upload.sent(), true, limits).unwrap_or(folder);
             }
             of_folder(&folder, limits).map(|(found, _)| found)
         }
@@ -134,14 +135,14 @@ pub struct FoundPhoto<'a> {
     /// Pose, checked.
     pub pose: CameraToWorld,
     /// The file.
-    pub bytes: Cow<'a, [u8]>,
+    pub bytes: FileBytes<'a>,
     /// Its mask, where it has one.
     pub mask: Option<FoundMask<'a>>,
 }
 
 impl FoundPhoto<'_> {
     fn candidate(&self) -> choose::Candidate<'_> {
-        let (bytes, kind) = (self.bytes.len() as u64, (&self.lens).into());
+        let (bytes, kind) = (self.bytes.size(), (&self.lens).into());
         choose::Candidate { pose: &self.pose, bytes, kind }
     }
 }
@@ -182,7 +183,7 @@ impl<'a> FoundPhotos<'a> {
 /// The photos of a form whose cameras are one JSON part.
 fn of_form<'a>(
     cameras: &UploadCameras,
-    files: &'a [UploadFile],
+    files: Vec<SentFile<'a>>,
     limits: &Limits,
 ) -> Result<FoundPhotos<'a>> {
     let Cameras { entries, held_out, unread } = match cameras {
@@ -195,18 +196,19 @@ fn of_form<'a>(
             cameras::cameras(json)?
         }
     };
-    names::paths(files, false, limits)?;
-    let masks = Masks::of(files.iter().map(|file| file.name.as_str()), true);
+    names::paths(&files, false, limits)?;
+    let masks = Masks::of(files.iter().map(|file| file.name), true);
     let placed: HashSet<&str> = masks.placed().collect();
     let photos: HashSet<String> =
         entries.iter().filter_map(|entry| names::normalise(&entry.file)).collect();
     let named: HashSet<&str> = (entries.iter().filter_map(|entry| entry.mask.as_deref()))
         .filter_map(|name| masks.named(name, |path| photos.contains(path)))
         .collect();
-    let is_mask = |file: &&UploadFile| placed.contains(&*file.name) || named.contains(&*file.name);
-    let (masked, files): (Vec<&UploadFile>, Vec<&UploadFile>) = files.iter().partition(is_mask);
+    let is_mask = |file: &SentFile<'_>| placed.contains(file.name) || named.contains(file.name);
+    let (masked, files): (Vec<SentFile<'a>>, Vec<SentFile<'a>>) =
+        files.iter().copied().partition(is_mask);
     check_count(files.len(), limits)?;
-    let sent: Vec<&str> = files.iter().map(|file| file.name.as_str()).collect();
+    let sent: Vec<&str> = files.iter().map(|file| file.name).collect();
     let (pairs, _) = paired(&entries, &sent)?;
     let used: HashSet<usize> = pairs.iter().map(|(_, file)| *file).collect();
     let held: HashSet<&str> = held_out.iter().map(|file| names::file_name(file)).collect();
@@ -216,11 +218,11 @@ fn of_form<'a>(
     if let Some(&i) = lone.first() {
         return Err(Error::invalid(format!(
             "{}: no camera has this file; the camera file names {} others",
-            label(i, &files[i].name),
+            label(i, files[i].name),
             entries.len()
         )));
     }
-    let size = |file: usize| files[file].bytes.len() as u64;
+    let size = |file: usize| files[file].bytes.size();
     let mut warnings: Vec<Warning> = told(
         WarningCode::PhotosUnused,
         kept_out.len(),
@@ -232,20 +234,20 @@ fn of_form<'a>(
     let (chosen, more) = chosen(&entries, pairs, &sent, size, limits)?;
     warnings.extend(more);
     warnings.extend(unread_keys(&unread));
-    let masks_sent: HashMap<&str, &'a [u8]> =
-        masked.iter().map(|file| (&*file.name, &*file.bytes)).collect();
+    let masks_sent: HashMap<&str, SentBytes<'a>> =
+        masked.iter().map(|file| (file.name, file.bytes)).collect();
     let taken: Vec<&str> = chosen.iter().map(|(_, file, _)| sent[*file]).collect();
     let (of_each, missing) = masks_of(&masks, &entries, &chosen, &taken);
     warnings.extend(missing);
     let take = |((entry, file, pose), mask): ((usize, usize, CameraToWorld), Option<Mask<'_>>)| {
-        let UploadFile { name, bytes } = &files[file];
+        let SentFile { name, bytes } = files[file];
         let mask = mask.and_then(|(path, marks_left_out)| {
-            let bytes = Cow::Borrowed(*masks_sent.get(path)?);
+            let bytes = FileBytes::from(*masks_sent.get(path)?);
             Some(FoundMask { path: path.to_owned(), bytes, marks_left_out })
         });
         FoundPhoto {
             mask,
-            ..found(&entries[entry], name.clone(), name.clone(), pose, bytes.into())
+            ..found(&entries[entry], name.to_owned(), name.to_owned(), pose, bytes.into())
         }
     };
     let all = chosen.into_iter().zip(of_each).map(take).collect();
@@ -319,10 +321,10 @@ fn of_folder<'a>(
     warnings.extend(no_mask);
     let take = |((entry, file, pose), mask): ((usize, usize, CameraToWorld), Option<Mask<'_>>)| {
         let (name, path) = (sent[file].to_owned(), names::join(&place, sent[file]));
-        let bytes = folder.read(&path)?;
+        let bytes = folder.later(&path)?;
         let mask = match mask {
             Some((path, marks_left_out)) => {
-                let bytes = folder.read(path)?;
+                let bytes = folder.later(path)?;
                 Some(FoundMask { path: path.to_owned(), bytes, marks_left_out })
             }
             None => None,
@@ -366,7 +368,7 @@ fn found<'a>(
     name: String,
     path: String,
     pose: CameraToWorld,
-    bytes: Cow<'a, [u8]>,
+    bytes: FileBytes<'a>,
 ) -> FoundPhoto<'a> {
     let (named, lens) = (entry.file.clone(), entry.lens.clone());
     FoundPhoto { name, path, named, lens, pose, bytes, mask: None }

@@ -19,7 +19,7 @@ pub(crate) use self::{spelling::Spelling, tails::Tails};
 use crate::{
     error::{Error, Result},
     limits::Limits,
-    scene::{UploadFile, photo_label as label},
+    scene::{SentFile, photo_label as label},
 };
 
 /// Extensions of photos, which are also tried where a camera's file has none, as instant-ngp does.
@@ -53,20 +53,20 @@ pub(crate) fn normalise(name: &str) -> Option<String> {
 ///
 /// # Errors
 /// `invalid_request`, `limit_exceeded`, each names the file.
-pub(crate) fn paths(files: &[UploadFile], decode: bool, limits: &Limits) -> Result<Vec<String>> {
+pub(crate) fn paths(files: &[SentFile<'_>], decode: bool, limits: &Limits) -> Result<Vec<String>> {
     let mut seen = HashSet::new();
-    let path = |(i, file): (usize, &UploadFile)| {
-        let what = label(i, &file.name);
+    let path = |(i, file): (usize, &SentFile<'_>)| {
+        let what = label(i, file.name);
         let (bytes, max) = (file.name.len(), limits.file_name_bytes_max);
         if bytes > max {
             return Err(Error::limit(format!("{what}: bytes of the file name"), bytes, max));
         }
-        let name = if decode { decoded(&file.name) } else { None };
-        let path = normalise(name.as_deref().unwrap_or(&file.name)).ok_or_else(|| {
+        let name = if decode { decoded(file.name) } else { None };
+        let path = normalise(name.as_deref().unwrap_or(file.name)).ok_or_else(|| {
             let why = "the path must be relative and stay inside the folder";
             Error::invalid(format!("{what}: {why}"))
         })?;
-        if !seen.insert(file.name.clone()) {
+        if !seen.insert(file.name.to_owned()) {
             let why = "two photos have this name; send paths as in the camera file";
             return Err(Error::invalid(format!("{what}: {why}")));
         }

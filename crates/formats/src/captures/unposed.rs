@@ -2,13 +2,14 @@
 //! copies of others at another size.
 
 use std::{
-    borrow::Cow,
     cmp::Reverse,
     collections::{BTreeMap, HashSet},
     path::Path,
 };
 
-use super::{FoundMask, check_count, folder::Folder, layouts, masks::Masks, names, not_read, told};
+use super::{
+    FileBytes, FoundMask, check_count, folder::Folder, layouts, masks::Masks, names, not_read, told,
+};
 use crate::{
     error::{Error, Result},
     limits::Limits,
@@ -21,7 +22,7 @@ pub struct UnposedFile<'a> {
     /// Its path.
     pub name: String,
     /// The file.
-    pub bytes: Cow<'a, [u8]>,
+    pub bytes: FileBytes<'a>,
     /// Its mask, where it has one.
     pub mask: Option<FoundMask<'a>>,
 }
@@ -46,23 +47,24 @@ pub fn find_unposed<'a>(
     mode: CamerasMode,
     limits: &'a Limits,
 ) -> Result<Option<FoundUnposed<'a>>> {
-    if upload.splats.is_some() || upload.cameras.is_some() && mode == CamerasMode::Auto {
+    if upload.sent_splats().is_some() || upload.cameras.is_some() && mode == CamerasMode::Auto {
         return Ok(None);
     }
     let total = upload.size_bytes();
     if total > limits.upload_bytes_max {
         return Err(Error::limit("upload bytes", total, limits.upload_bytes_max));
     }
-    let folder = match &upload.archive {
+    let archive = upload.sent_archive();
+    let folder = match archive {
         Some(archive) => Folder::of_archive(archive, limits)?,
-        None => Folder::of_form(&upload.photos, false, limits)?,
+        None => Folder::of_form(upload.sent(), false, limits)?,
     };
     if is_described(&folder, mode) {
         return Ok(None);
     }
-    if upload.archive.is_none() && mode == CamerasMode::Auto {
+    if archive.is_none() && mode == CamerasMode::Auto {
         // Paths of cameras may be encoded.
-        let decoded = Folder::of_form(&upload.photos, true, limits);
+        let decoded = Folder::of_form(upload.sent(), true, limits);
         if decoded.is_ok_and(|folder| is_described(&folder, mode)) {
             return Ok(None);
         }
@@ -126,12 +128,12 @@ fn of_folder<'a>(folder: &Folder<'a>) -> Result<FoundUnposed<'a>> {
     let take = |path: &str| {
         let mask = match masks.of_photo(path) {
             Some((mask, marks_left_out)) => {
-                let bytes = folder.read(mask)?;
+                let bytes = folder.later(mask)?;
                 Some(FoundMask { path: mask.to_owned(), bytes, marks_left_out })
             }
             None => None,
         };
-        Ok(UnposedFile { name: path.to_owned(), bytes: folder.read(path)?, mask })
+        Ok(UnposedFile { name: path.to_owned(), bytes: folder.later(path)?, mask })
     };
     let photos = chosen.into_iter().map(take).collect::<Result<_>>()?;
     Ok(FoundUnposed { photos, warnings })

@@ -37,7 +37,8 @@ fn read(files: &Files) -> Result<Found> {
     let limits = Limits::default();
     let found = find(&upload, &limits)?;
     let photo = |photo: &segsplat_formats::captures::FoundPhoto<'_>| {
-        let size = image::ImageReader::new(Cursor::new(&photo.bytes[..]));
+        let bytes = photo.bytes.read().unwrap();
+        let size = image::ImageReader::new(Cursor::new(&bytes[..]));
         let (width, height) = size.with_guessed_format().unwrap().into_dimensions().unwrap();
         let lens = photo.lens.at_size(width, height, "test").unwrap();
         (photo.path.clone(), lens.intrinsics.fx, photo.pose.center().to_array())

@@ -23,7 +23,8 @@ pub(super) fn applied(
     limits: &Limits,
 ) -> Result<Photo> {
     let what = format!("{what}: its mask {:?}", short(&mask.path));
-    let header = decode::header(&mask.bytes, &what, limits)?;
+    let bytes = mask.bytes.read()?;
+    let header = decode::header(&bytes, &what, limits)?;
     let ([w, h], size) = (header.size(), [photo.width, photo.height]);
     if !same_aspect([w, h], size) {
         let [width, height] = size;
@@ -32,7 +33,7 @@ pub(super) fn applied(
              says how they fit"
         )));
     }
-    let kept = decode::kept(&mask.bytes, &header, &what, limits)?;
+    let kept = decode::kept(&bytes, &header, &what, limits)?;
     let [mask_width, mask_height] = kept.size.map(|side| side as usize);
     let (width, height) = (photo.width as usize, photo.height as usize);
     // The pixel of the mask at the middle of a pixel of the photo.

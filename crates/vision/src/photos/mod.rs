@@ -29,8 +29,8 @@ pub use crate::scene::{Upload, UploadCameras, UploadFile};
 use crate::{
     error::{Result, short},
     formats::captures::{
-        FoundPhoto, FoundPhotos, FoundUnposed, LensAtSize, find, find_in_dir, find_unposed,
-        find_unposed_in_dir,
+        FoundMask, FoundPhoto, FoundPhotos, FoundUnposed, LensAtSize, find, find_in_dir,
+        find_unposed, find_unposed_in_dir,
     },
     limits::Limits,
     photo_label as label,
@@ -54,7 +54,7 @@ pub struct ReadPhotos {
 
 /// Reads an upload into photos with cameras, in the order of the cameras.
 ///
-/// An archive is unpacked in memory under the limits. See the module for what is converted.
+/// An archive is unpacked a file at a time under the limits. See the module for what is converted.
 ///
 /// # Errors
 /// `invalid_request` for missing, surplus or impossible cameras, `photo_unreadable` for files that
@@ -93,13 +93,20 @@ pub fn read_dir_until(
     let read = decoded(&found, limits, cancel)?;
     let (mut photos, mut masks) = (Vec::new(), BTreeMap::new());
     for of in found.photos.into_iter().chain(found.more) {
-        photos.push(UploadFile { name: of.path, bytes: of.bytes.into_owned() });
+        photos.push(UploadFile { name: of.path, bytes: of.bytes.read()?.into_owned() });
         // Several photos may have one mask.
-        masks.extend(of.mask.map(|mask| (mask.path, mask.bytes.into_owned())));
+        put_mask(&mut masks, of.mask)?;
     }
     let masks = masks.into_iter().map(|(name, bytes)| UploadFile { name, bytes });
     photos.extend(cameras.into_iter().chain(masks));
     Ok((read, Upload { photos, ..Upload::default() }))
+}
+
+fn put_mask(masks: &mut BTreeMap<String, Vec<u8>>, mask: Option<FoundMask<'_>>) -> Result<()> {
+    if let Some(mask) = mask {
+        masks.insert(mask.path, mask.bytes.read()?.into_owned());
+    }
+    Ok(())
 }
 
 /// Reads the photos of an upload that only the steps of a refinement learn, each with its longer
@@ -170,8 +177,8 @@ pub fn read_unposed_dir(
     let mut masks = BTreeMap::new();
     let mut photos = Vec::with_capacity(found.photos.len());
     for file in found.photos {
-        photos.push(UploadFile { name: file.name, bytes: file.bytes.into_owned() });
-        masks.extend(file.mask.map(|mask| (mask.path, mask.bytes.into_owned())));
+        photos.push(UploadFile { name: file.name, bytes: file.bytes.read()?.into_owned() });
+        put_mask(&mut masks, file.mask)?;
     }
     photos.extend(masks.into_iter().map(|(name, bytes)| UploadFile { name, bytes }));
     Ok(Some((read, Upload { photos, ..Upload::default() })))
@@ -218,7 +225,9 @@ impl<'f, 'a> Undecoded<'f, 'a> {
     /// without the distortion of its lens; also the shares of its pixels that these two took.
     fn read(&self, side_max: u32, limits: &Limits) -> Result<(PosedPhoto, [f64; 2])> {
         let (found, lens) = (self.found, &self.lens);
-        let photo = decode::pixels(&found.bytes, &self.header, self.turn, &self.label, limits)?;
+        let bytes = found.bytes.read()?;
+        let photo = decode::pixels(&bytes, &self.header, self.turn, &self.label, limits)?;
+        drop(bytes);
         let before = valid_share(&photo);
         let photo = match &found.mask {
             Some(mask) => mask::applied(photo, mask, &self.label, limits)?,
@@ -305,7 +314,7 @@ struct WithHeader<'f, 'a> {
 impl<'f, 'a> WithHeader<'f, 'a> {
     fn new(i: usize, found: &'f FoundPhoto<'a>, limits: &Limits) -> Result<Self> {
         let label = label(i, &found.named);
-        let header = decode::header(&found.bytes, &label, limits)?;
+        let header = decode::header(&found.bytes.read()?, &label, limits)?;
         let way = turns::way(&header, &found.lens);
         Ok(Self { found, label, header, way })
     }
@@ -415,7 +424,8 @@ pub fn each(
         let (file, camera_to_world) = (one.found.name.as_str(), one.found.pose);
         if one.is_as_sent(all.side_max) {
             let camera = Camera { intrinsics: one.lens.intrinsics, camera_to_world };
-            see(SentPhoto { file, camera, pixels: SentPixels::File(&one.found.bytes) })?;
+            let bytes = one.found.bytes.read()?;
+            see(SentPhoto { file, camera, pixels: SentPixels::File(&bytes) })?;
         } else {
             let (PosedPhoto { photo, camera, .. }, _) = one.read(all.side_max, limits)?;
             see(SentPhoto { file, camera, pixels: SentPixels::Made(photo) })?;

@@ -72,7 +72,7 @@ impl<'f, 'a> Undecoded<'f, 'a> {
     pub(super) fn all(found: &'f FoundUnposed<'a>, limits: &Limits) -> Result<Vec<Self>> {
         let one = |(i, file): (usize, &'f UnposedFile<'a>)| {
             let label = label(i, &file.name);
-            let header = decode::header(&file.bytes, &label, limits)?;
+            let header = decode::header(&file.bytes.read()?, &label, limits)?;
             Ok(Self { file, label, header })
         };
         found.photos.iter().enumerate().map(one).collect()
@@ -81,14 +81,16 @@ impl<'f, 'a> Undecoded<'f, 'a> {
     /// The photo, upright, with its longer side at most `side_max`.
     pub(super) fn read(&self, side_max: u32, limits: &Limits) -> Result<UnposedPhoto> {
         let Self { file, label, header } = self;
-        let photo = decode::pixels(&file.bytes, header, header.orientation, label, limits)?;
+        let bytes = file.bytes.read()?;
+        let photo = decode::pixels(&bytes, header, header.orientation, label, limits)?;
         let photo = match &file.mask {
             Some(mask) => mask::applied(photo, mask, label, limits)?,
             None => photo,
         };
         // The focal length follows the photo's size as intrinsics do.
         let size = [photo.width, photo.height];
-        let focal = decode::focal(&file.bytes, header, size);
+        let focal = decode::focal(&bytes, header, size);
+        drop(bytes);
         let f = focal.unwrap_or(1.0);
         let lens = Intrinsics { fx: f, fy: f, cx: 0.0, cy: 0.0, width: size[0], height: size[1] };
         let (photo, lens) = decode::at_most(photo, lens, side_max);

@@ -13,14 +13,14 @@ use segsplat_render::{
 };
 
 use super::{
-    PhotoSet, Pipeline, Reconstruction, Seen, Stages, lifted, of_sets, see, sets::newest, united,
-    views_of, with_reading,
+    PhotoSet, Pipeline, Reconstruction, Seen, Stages, lifted, of_sets, refinement::at_side, see,
+    sets::newest, united, views_of, with_reading,
 };
 use crate::{
     capture, center_of,
     error::{Error, Result},
     lift::{Fusion, UnionOptions},
-    refine::{halved_photo, judged_as_served},
+    refine::judged_as_served,
     scene::{
         Camera, Gaussians, HealthReport, PosedPhoto, Scene, SceneCamera, SceneMeta, SceneOptions,
         Stage, Watch,
@@ -38,8 +38,8 @@ const LEARNT_SIDE: u32 = 640;
 
 /// Old photos that judge whether a scene that is made again is as good: those nearest to new ones.
 const JUDGES: usize = 6;
-/// Largest longer side of the pictures that they judge, pixels.
-const JUDGED_SIDE: u32 = 400;
+/// Longer side of the pictures that they judge, pixels.
+const JUDGED_SIDE: u32 = 320;
 /// What they may lose in the mean, dB.
 const LOST_DB: f64 = 0.05;
 
@@ -231,7 +231,7 @@ fn is_as_good(
     let made = Scene::new(meta, made.gaussians.clone(), made.backdrop.clone());
     let mut gain = 0.0;
     for photo in judges(photos, kept.len(), made.meta.report.median_depth) {
-        let truth = [small(&photos[photo])];
+        let truth = [at_side(&photos[photo], JUDGED_SIDE)];
         let of = |scene: &Scene, number: usize| {
             judged_as_served(renderer, &without(scene, number), &truth)
         };
@@ -254,15 +254,6 @@ fn judges(photos: &[PosedPhoto], before: usize, depth: f64) -> Vec<usize> {
         old.iter().enumerate().map(|(i, photo)| (to_new(photo), i)).collect();
     near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     near.into_iter().take(JUDGES).map(|(_, photo)| photo).collect()
-}
-
-/// A photo halved until its longer side is at most [`JUDGED_SIDE`].
-fn small(photo: &PosedPhoto) -> PosedPhoto {
-    let mut small = photo.clone();
-    while small.photo.width.max(small.photo.height) > JUDGED_SIDE {
-        small = halved_photo(&small);
-    }
-    small
 }
 
 /// A scene as it is served without what one of its photos gave it.

@@ -25,12 +25,12 @@ use crate::{
     photos,
     refine::{
         self, ALIGNING_STEPS, Judged, LearntPhotos, MorePhotos, PhotoSpool, RefineBudget,
-        RefineOptions, RefinedVersion, Stepped, TRANSIENT_SIDE, UNWATCHED_STEPS_MAX, aligned,
-        carried, covered, differences, extent, fewer, held_out, judged_as_plain, judged_as_served,
-        ready, transient, transient_of, unexplained,
+        RefineOptions, RefinedVersion, Stepped, UNWATCHED_STEPS_MAX, aligned, carried, covered,
+        differences, extent, fewer, held_out, judged_as_plain, judged_as_served, ready,
+        unexplained,
     },
     scene::{
-        Camera, CameraToWorld, CameraUse, CamerasMode, Gaussians, HealthReport, IndexMap, Method,
+        Camera, CameraToWorld, CameraUse, CamerasMode, Gaussians, HealthReport, Method,
         MovedCamera, Photo, PosedPhoto, RefineReport, Scene, SceneCamera, SceneMeta, Semantics,
         Upload,
     },
@@ -56,9 +56,6 @@ const SETTLING_ROUNDS: usize = 2;
 const LEFT_OUT_FROM: f64 = 0.75;
 const LEFT_OUT_FACTOR: f64 = 2.0;
 
-/// Nothing is left out for passing by where no photo shows so much of it, as a share of the photo.
-const TRANSIENT_MIN: f64 = 0.01;
-
 /// A proof that differs so many times as much from the held-out photos as from learnt ones is no
 /// proof: nothing is published (docs/adr/0073).
 const OVERFIT_REFUSED: f64 = 6.0;
@@ -78,9 +75,6 @@ pub struct Refined {
     /// What the held-out photos gained by cameras that fit the first proof ([`Judged::score`]);
     /// `None` where that was not asked.
     pub pose_gain: Option<f64>,
-    /// What the held-out photos gained where what single photos show alone was left out of all,
-    /// judged without it, and with it; `None` where there was nothing of the kind.
-    pub transient_gain: Option<[f64; 2]>,
     /// Versions that were published.
     pub versions: u32,
 }
@@ -153,7 +147,6 @@ pub fn refined(
         given,
         mends: false,
         left_out: Vec::new(),
-        transient: Vec::new(),
         options,
         calls,
         done: Work::default(),
@@ -212,9 +205,6 @@ struct Parts<'a, 'c> {
     mends: bool,
     /// Photos whose cameras cannot be right.
     left_out: Vec<usize>,
-    /// Cells of each photo that show what the others do not, and are left out; none where nothing
-    /// is.
-    transient: Vec<IndexMap>,
     options: RefineOptions,
     calls: RefineCalls<'c>,
     /// All that was done so far.
@@ -233,8 +223,7 @@ impl Parts<'_, '_> {
         let (gaussians, poses) = (made.gaussians, self.poses());
         let version = RefinedVersion { gaussians, report: report.clone(), poses };
         (self.calls.publish)(&start, &version)?;
-        let (overfit, pose_gain, transient_gain) = (None, None, None);
-        Ok(Refined { report, overfit, pose_gain, transient_gain, versions: 1 })
+        Ok(Refined { report, overfit: None, pose_gain: None, versions: 1 })
     }
 
     /// Photos of which those of the numbers `held` say how good versions are.
@@ -243,16 +232,14 @@ impl Parts<'_, '_> {
         let before = self.judged_before(held, &start)?;
         let mut proof = Proof { held, start, gaussians: first.clone(), judged: None, before };
         let report = self.as_before(before);
-        let mut found =
-            Refined { report, overfit: None, pose_gain: None, transient_gain: None, versions: 0 };
+        let mut found = Refined { report, overfit: None, pose_gain: None, versions: 0 };
         let (mut first, mut whole) = (Some(first), None::<Whole>);
         while let Some(part) = self.next_part(whole.is_some()) {
             let options = self.options_of(part, first.is_some());
             let last = proof.judged.filter(|_| whole.is_some());
             let proven = self.prove(&mut proof, part, &options)?;
             if let Some(first) = first.take() {
-                (found.pose_gain, found.transient_gain) =
-                    self.mend_first(&mut proof, first, part, &options)?;
+                found.pose_gain = self.mend_first(&mut proof, first, part, &options)?;
                 found.report = self.as_before(proof.before);
             } else if self.mends {
                 self.fit_held_out(&mut proof)?;
@@ -303,16 +290,15 @@ impl Parts<'_, '_> {
     }
 
     /// What the first proof says of the photos, which began with the Gaussians `first`: those that
-    /// cannot be right are left out, where cameras are wrong it is made again with mended ones, and
-    /// then without what passes by. What the held-out photos gain by cameras that fit, and without
-    /// what passes by.
+    /// cannot be right are left out, and where cameras are wrong it is made again with mended ones.
+    /// What the held-out photos gain by cameras that fit.
     fn mend_first(
         &mut self,
         proof: &mut Proof<'_>,
         mut first: Gaussians,
         part: RefineBudget,
         options: &RefineOptions,
-    ) -> Result<(Option<f64>, Option<[f64; 2]>)> {
+    ) -> Result<Option<f64>> {
         let is_asked = self.options.pose_rate > 0.0;
         let gain = if is_asked { self.fit_held_out(proof)? } else { None };
         if self.leave_out(proof)? {
@@ -320,7 +306,6 @@ impl Parts<'_, '_> {
             first = self.without_left_out(&first);
             proof.judged = self.judged(proof)?;
         }
-        let mut begun = first.clone();
         if self.mends {
             if let Some(poses) = (self.calls.recast)()? {
                 self.stand_all(&poses);
@@ -329,82 +314,13 @@ impl Parts<'_, '_> {
                 first = self.without_left_out(&first);
             }
             proof.gaussians = self.settle_cameras(proof.held, &proof.start, &first)?;
-            begun.clone_from(&proof.gaussians);
             self.prove(proof, part, options)?;
             self.fit_held_out(proof)?;
         }
-        let without = self.leave_out_transient(proof, &begun, part, options)?;
-        if self.mends || !self.left_out.is_empty() || !self.transient.is_empty() {
-            first = self.without_transient(&first);
+        if self.mends || !self.left_out.is_empty() {
             proof.before = self.judged_before_fitting(proof.held, &proof.start, &first)?;
         }
-        Ok((gain, without))
-    }
-
-    /// Leaves out from now on what single photos show alone, where the held-out photos gain by it:
-    /// the proof is made again, from the Gaussians `first` less those of such pixels. What the
-    /// held-out photos gain without such pixels, and with them, where they must not lose: what is
-    /// left out by mistake is missing there. `None` where there is nothing of the kind.
-    fn leave_out_transient(
-        &mut self,
-        proof: &mut Proof<'_>,
-        first: &Gaussians,
-        part: RefineBudget,
-        options: &RefineOptions,
-    ) -> Result<Option<[f64; 2]>> {
-        if self.options.transient_from.is_infinite() {
-            return Ok(None);
-        }
-        let small: Vec<PosedPhoto> =
-            self.photos.par_iter().map(|photo| at_side(photo, TRANSIENT_SIDE)).collect();
-        let maps = transient(self.renderer, &proof.start, &proof.gaussians, &small)?;
-        let most = maps.iter().map(IndexMap::share).fold(0.0, f64::max);
-        if most < TRANSIENT_MIN {
-            return Ok(None);
-        }
-        let held_whole = self.parted(proof.held).1;
-        let valid: Vec<Option<Vec<bool>>> =
-            self.photos.iter().map(|posed| posed.photo.valid.clone()).collect();
-        self.photos.iter_mut().zip(&maps).for_each(|(posed, map)| posed.photo.leave_out(map));
-        self.transient = maps;
-        let with = self.judged(proof)?;
-        let (before, poses) = ((proof.gaussians.clone(), proof.judged), self.poses());
-        let done = self.done;
-        proof.gaussians = self.without_transient(first);
-        self.prove(proof, part, options)?;
-        let gain_of = |from: Option<Judged>, to: Option<Judged>| {
-            from.zip(to).map_or(0.0, |(from, to)| to.score() - from.score())
-        };
-        let of_whole = judged_as_plain(self.renderer, &proof.start, &proof.gaussians, &held_whole)?;
-        let gains = [gain_of(with, proof.judged), gain_of(before.1, of_whole)];
-        tracing::debug!(?gains, most, "without what single photos show alone");
-        if gains[0] < self.options.transient_from || gains[1] < 0.0 {
-            (proof.gaussians, proof.judged) = before;
-            // What comes then is as if nobody had asked.
-            self.stand_all(&poses);
-            self.done = done;
-            self.transient.clear();
-            let photos = self.photos.iter_mut().zip(valid);
-            photos.for_each(|(posed, valid)| posed.photo.valid = valid);
-            return Ok(Some(gains));
-        }
-        let spent = self.spent(self.done.steps, self.done.time);
-        if let Some(more) = &self.more {
-            for &number in &more.numbers {
-                (self.calls.pace)(spent)?;
-                let photo = at_side(&more.spool.posed(number)?, TRANSIENT_SIDE);
-                let map = transient_of(self.renderer, &proof.start, &proof.gaussians, &photo)?;
-                more.spool.leave_out(number, map);
-            }
-        }
-        Ok(Some(gains))
-    }
-
-    /// The Gaussians that did not come from pixels that are left out for what they show alone.
-    fn without_transient(&self, gaussians: &Gaussians) -> Gaussians {
-        let cameras = &self.scene.meta.cameras;
-        let left_out = assigned(gaussians.source(), cameras, &self.transient);
-        gaussians.only(|i| left_out[i] == 0)
+        Ok(gain)
     }
 
     /// Whether the proof is better than what is served, or enough so than it was at the `last`
@@ -771,7 +687,7 @@ impl Parts<'_, '_> {
     /// The scene of all photos, before its first step.
     fn begin_whole(&mut self, proof: &Proof<'_>) -> Result<Whole> {
         let (start, gaussians) = self.begin(&self.left_out.clone())?;
-        let gaussians = self.without_transient(&self.with_cameras(gaussians)?);
+        let gaussians = self.with_cameras(gaussians)?;
         let differs = |at: &dyn Fn(usize) -> usize| {
             let is_used = |i: &usize| !self.left_out.contains(i);
             let held = proof.held.iter().filter(|&i| is_used(i) && is_used(&(i - 1)));
@@ -808,7 +724,6 @@ impl Parts<'_, '_> {
             gaussians_before: gaussians,
             gaussians_after: gaussians,
             left_out: left_out.chain(more.map(str::to_owned)).collect(),
-            transient: self.transient.iter().map(IndexMap::share).collect(),
             ..RefineReport::default()
         }
     }

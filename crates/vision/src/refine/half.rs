@@ -1,6 +1,6 @@
 //! Photos at half their size, which are learnt first.
 
-use crate::scene::{Camera, Intrinsics, Photo, PosedPhoto};
+use crate::scene::{Camera, Intrinsics, Photo};
 
 /// A photo of half the size: the mean of each two by two pixels. One is known where all four are.
 pub(super) fn halved(photo: &Photo) -> Photo {
@@ -29,10 +29,4 @@ pub(super) fn halved_camera(camera: Camera) -> Camera {
     let (width, height) = (lens.width / 2, lens.height / 2);
     let [fx, fy, cx, cy] = [lens.fx, lens.fy, lens.cx, lens.cy].map(|v| v / 2.0);
     Camera { intrinsics: Intrinsics { fx, fy, cx, cy, width, height }, ..camera }
-}
-
-/// A photo with its camera at half the size.
-pub(crate) fn halved_photo(posed: &PosedPhoto) -> PosedPhoto {
-    let (photo, camera) = (halved(&posed.photo), halved_camera(posed.camera));
-    PosedPhoto { photo, camera, ..posed.clone() }
 }

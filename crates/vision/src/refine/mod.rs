@@ -20,7 +20,6 @@
 
 mod half;
 mod spool;
-mod transient;
 
 use std::{
     sync::Arc,
@@ -39,14 +38,10 @@ use segsplat_render::{
     },
 };
 
-pub(crate) use self::{half::halved_photo, transient::transient_of};
+pub use self::spool::{MorePhotos, PhotoSpool};
 use self::{
     half::{halved, halved_camera},
     spool::Halved,
-};
-pub use self::{
-    spool::{MorePhotos, PhotoSpool},
-    transient::{TRANSIENT_SIDE, transient},
 };
 pub use segsplat_render::train::LearningRates;
 
@@ -158,10 +153,6 @@ pub struct RefineOptions {
     /// What held-out photos must gain by cameras that fit what the others show, for cameras to be
     /// learnt ([`Judged::score`], [`crate::pipeline::refinement::refined`]).
     pub mends_from: f64,
-    /// What held-out photos must gain by leaving out what single photos show alone, for it to be
-    /// left out ([`Judged::score`], [`crate::pipeline::refinement::refined`]); infinity: nobody
-    /// asks (docs/adr/0092).
-    pub transient_from: f64,
     /// Steps until the first version ([`crate::pipeline::refinement::refined`]).
     pub first_steps: u32,
     /// What the work on a further version must gain on the held-out photos ([`Judged::score`]).
@@ -198,7 +189,6 @@ impl Default for RefineOptions {
             ssim_share: 0.2,
             pose_rate: 1e-3,
             mends_from: 0.25,
-            transient_from: f64::INFINITY,
             first_steps: 400,
             gain_min: 0.2,
             proof_share: 0.25,

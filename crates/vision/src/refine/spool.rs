@@ -2,7 +2,6 @@
 //! hundreds of photos.
 
 use std::{
-    collections::BTreeMap,
     fs::File,
     io::{Read, Seek, SeekFrom, Write},
     path::Path,
@@ -15,7 +14,7 @@ use segsplat_render::train::PhotoSource;
 use super::half::halved;
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Camera, IndexMap, Photo, PosedPhoto},
+    scene::{Camera, Photo, PosedPhoto},
 };
 
 /// Photos on disk and where they were taken from. The file goes with the last who has it.
@@ -26,8 +25,6 @@ pub struct PhotoSpool {
     /// Where each begins, whether some of its pixels are not valid, and where the last one ends.
     places: Vec<(u64, bool)>,
     end: u64,
-    /// Cells of photos that are left out beside what is not valid.
-    left_out: Mutex<BTreeMap<usize, IndexMap>>,
     /// RGB of each photo, `[H * W * 3]`, then a byte a pixel where some are not valid.
     file: Mutex<File>,
 }
@@ -41,7 +38,7 @@ impl PhotoSpool {
         let made = dir.map_or_else(tempfile::tempfile, tempfile::tempfile_in);
         let file = Mutex::new(made.map_err(|e| unavailable("photos cannot be kept").caused_by(e))?);
         let (files, cameras, places) = (Vec::new(), Vec::new(), Vec::new());
-        Ok(Self { files, cameras, places, end: 0, left_out: Mutex::default(), file })
+        Ok(Self { files, cameras, places, end: 0, file })
     }
 
     /// Puts a photo behind the others.
@@ -82,11 +79,6 @@ impl PhotoSpool {
     #[must_use]
     pub fn cameras(&self) -> &[Camera] {
         &self.cameras
-    }
-
-    /// Leaves cells of a photo out from now on.
-    pub(crate) fn leave_out(&self, number: usize, map: IndexMap) {
-        self.left_out.lock().insert(number, map);
     }
 
     /// A photo with its camera.
@@ -145,11 +137,7 @@ impl PhotoSource for PhotoSpool {
         });
         read.map_err(|e| unavailable("a photo cannot be read again").caused_by(e))?;
         let valid = has_invalid.then(|| valid.iter().map(|&v| v != 0).collect());
-        let mut photo = Photo { width, height, rgb, valid };
-        if let Some(map) = self.left_out.lock().get(&number) {
-            photo.leave_out(map);
-        }
-        Ok(photo)
+        Ok(Photo { width, height, rgb, valid })
     }
 }
 
