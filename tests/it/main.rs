@@ -42,6 +42,7 @@ mod paper;
 mod proto;
 mod raw;
 mod refine;
+mod scale;
 mod schedule;
 mod slow_callers;
 mod splat_scenes;

@@ -48,7 +48,7 @@ use crate::{
     error::{Error, Result},
     limits::Limits,
     scene::{
-        CameraToWorld, Upload, UploadCameras, UploadFile, Warning, WarningCode,
+        CameraToWorld, LengthUnit, Upload, UploadCameras, UploadFile, Warning, WarningCode,
         photo_label as label,
     },
 };
@@ -155,6 +155,8 @@ pub struct FoundPhotos<'a> {
     pub more: Vec<FoundPhoto<'a>>,
     /// What was not used or not there.
     pub warnings: Vec<Warning>,
+    /// What a unit of the poses is.
+    pub unit: LengthUnit,
 }
 
 impl<'a> FoundPhotos<'a> {
@@ -175,7 +177,7 @@ impl<'a> FoundPhotos<'a> {
         );
         let names = more.iter().map(|photo| &*photo.name);
         warnings.extend(told(WarningCode::PhotosForSteps, more.len(), &why, names));
-        Self { photos, more, warnings }
+        Self { photos, more, warnings, unit: LengthUnit::Unknown }
     }
 }
 
@@ -260,6 +262,7 @@ fn of_folder<'a>(
     let tests = test_list(folder)?;
     let mut files = folder.take_cameras_read();
     let Best { candidate, warning } = candidates::best(folder, &tests)?;
+    let unit = candidate.unit();
     let masks = Masks::of(folder.paths(), candidate.has_mask_folder() || folder.is_form());
     files.extend(candidate.files);
     let Candidate { entries, held_out, unread, place, sent, pairs, missing, .. } = candidate;
@@ -330,7 +333,7 @@ fn of_folder<'a>(
         Ok(FoundPhoto { mask, ..found(&entries[entry], name, path, pose, bytes) })
     };
     let all = chosen.into_iter().zip(of_each).map(take).collect::<Result<_>>()?;
-    Ok((FoundPhotos::of(all, warnings, limits), files))
+    Ok((FoundPhotos { unit, ..FoundPhotos::of(all, warnings, limits) }, files))
 }
 
 /// The message where no camera has its photo.

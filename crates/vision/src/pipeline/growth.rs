@@ -20,7 +20,7 @@ use crate::{
     capture, center_of,
     error::{Error, Result},
     lift::{Fusion, UnionOptions},
-    refine::{halved_photo, judged_as_served},
+    refine::{halved_photo, judged_without},
     scene::{
         Camera, Gaussians, HealthReport, PosedPhoto, Scene, SceneCamera, SceneMeta, SceneOptions,
         Stage, Watch,
@@ -231,10 +231,8 @@ fn is_as_good(
     let made = Scene::new(meta, made.gaussians.clone(), made.backdrop.clone());
     let mut gain = 0.0;
     for photo in judges(photos, kept.len(), made.meta.report.median_depth) {
-        let truth = [small(&photos[photo])];
-        let of = |scene: &Scene, number: usize| {
-            judged_as_served(renderer, &without(scene, number), &truth)
-        };
+        let truth = small(&photos[photo]);
+        let of = |scene: &Scene, number| judged_without(renderer, scene, number, &truth);
         if let (Some(old), Some(new)) = (of(served, kept[photo])?, of(&made, photo)?) {
             gain += new.psnr - old.psnr + LOST_DB;
         }
@@ -263,17 +261,6 @@ fn small(photo: &PosedPhoto) -> PosedPhoto {
         small = halved_photo(&small);
     }
     small
-}
-
-/// A scene as it is served without what one of its photos gave it.
-fn without(scene: &Scene, photo: usize) -> Scene {
-    let source = scene.gaussians.source();
-    let gaussians = scene.gaussians.only(|i| usize::from(source[i].view) != photo);
-    let mut meta = scene.meta.clone();
-    if let Some(focal) = meta.report.network_focal_px.get_mut(photo) {
-        *focal = 0.0;
-    }
-    Scene { meta, gaussians, semantics: None, ..scene.clone() }
 }
 
 /// The Gaussians of the photos `kept`, whose numbers are their places there.
