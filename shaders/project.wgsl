@@ -55,11 +55,14 @@ fn project_one(i: u32) -> Footprint {
     let photo = gaussian.source & 0xffffu;
     if photo < views[which].source_count {
         let source = sources[views[which].source_start + photo];
+        if source.layer == LEFT_OUT {
+            return footprint;
+        }
         blur = blur_of(gaussian, source, t.z);
         if blur.lost > 0.0 {
             scale = sqrt(scale * scale + blur.lost);
         }
-        footprint.depth = select(t.z, -t.z, source.behind != 0u);
+        footprint.depth = select(t.z, -t.z, source.layer == BEHIND);
     }
     let slope = t.xy / t.z;
     let clamped = clamp(slope, views[which].slope_min, views[which].slope_max);

@@ -112,8 +112,13 @@ function over(width, height) {
   });
   pen.globalAlpha = 1;
   for (const [color, boxes] of outlines()) draw(color, boxes.flatMap(edgesOf));
+  if (state.ground && state.scale?.ground) draw('#6cf', groundLines());
   if (state.marks.length) {
-    if (state.marks.length > 1) draw('#ff0', [state.marks]);
+    if (state.marks.length > 1) {
+      const next = (i) => state.marks[(i + 1) % state.marks.length];
+      const legs = state.marks.map((mark, i) => [mark, next(i)]);
+      draw('#ff0', state.marks.length > 2 ? legs : [state.marks]);
+    }
     for (const mark of state.marks) {
       const at = seen(mark);
       if (at[2] < near) continue;
@@ -125,6 +130,22 @@ function over(width, height) {
       pen.stroke();
     }
   }
+}
+// Lines of squares on the ground around its middle: of a metre where metres are known.
+function groundLines() {
+  const { normal, point } = state.scale.ground,
+    ahead = axesOf(state.camera)[2],
+    x = unit(cross(normal, Math.abs(dot(normal, ahead)) < 0.99 ? ahead : axesOf(state.camera)[1])),
+    z = cross(x, normal),
+    // Squares of 1, 2 or 5 times a power of ten, about a quarter of the scene's extent.
+    wanted = 0.25 * state.scene.unit * metre(),
+    ten = 10 ** Math.floor(Math.log10(wanted)),
+    side = ([5, 2, 1].find((k) => k * ten <= wanted) * ten) / metre(),
+    at = (i, j) => add(add(point, x, i * side), z, j * side);
+  return Array.from({ length: 9 }, (_, i) => i - 4).flatMap((i) => [
+    [at(i, -4), at(i, 4)],
+    [at(-4, i), at(4, i)],
+  ]);
 }
 // The eight corners of a box, and its twelve edges.
 const cornersOf = ({ center, axes, size }) =>

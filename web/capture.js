@@ -51,6 +51,16 @@ async function readCapture(files, at) {
   files = files.filter(({ path }) => !HIDDEN.test(path));
   const capture = { form: new FormData(), rows: [], faults: [], notes: [] },
     { form, rows, faults, notes } = capture;
+  const video = files.find(({ path }) => VIDEO.test(path));
+  if (video && !files.some(({ path }) => PHOTO.test(path) || ARCHIVE.test(path))) {
+    try {
+      files = await framesOf(video, at);
+      notes.push(t('video.taken', { n: files.length, name: video.path }));
+    } catch (error) {
+      faults.push(error.message);
+      return capture;
+    }
+  }
   const alone = (field, { path, file }) => {
     form.append(field, file, fileName(path));
     rows.push({ name: path, faults: [] });

@@ -90,7 +90,7 @@ async function showEdited(id) {
 // What an edit does, in words, and how many Gaussians it took.
 const said = (one, n) => `${deedOf(one)} (${t('gaussians', { n: count(n) })})`;
 function deedOf({ op, select }) {
-  const kind = ['text', 'point', 'pick', 'box', 'sphere'].find((key) => select[key]);
+  const kind = ['text', 'point', 'pick', 'box', 'sphere', 'floaters'].find((key) => select[key]);
   let what = kind === 'text' ? select.text : t(`edit.of.${kind}`);
   if (select.parts) what += ` ${select.parts.map((part) => part + 1).join(', ')}`;
   return t(`edit.${op}`, { what });
@@ -210,7 +210,7 @@ function choose(what) {
     $(`move-${name}`).step = Number((0.02 * state.scene.unit * metre()).toPrecision(1));
   }
   for (const node of document.querySelectorAll('.of-length'))
-    node.textContent = metres.of(state.scene.id) ? 'm' : t('units');
+    node.textContent = metresKnown() ? 'm' : t('units');
 }
 
 // One part of the word that is chosen, or all of it.
@@ -294,6 +294,9 @@ function bindEdits() {
   $('undo').onclick = ready(undo);
   $('redo').onclick = ready(redo);
   $('edit-box').onclick = ready(chooseBox);
+  $('edit-floaters').onclick = ready(() =>
+    edit((now) => [...now, { op: 'delete', select: { floaters: true } }]),
+  );
   $('act-delete').onclick = () => act('delete');
   $('act-keep').onclick = () => act('keep');
   $('act-close').onclick = actNoMore;

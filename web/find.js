@@ -108,24 +108,78 @@ function letGo() {
 const textsShown = () => state.words.filter((word) => !word.isThing).map((word) => word.text);
 
 function mark(point) {
-  state.marks = state.marks.length === 1 ? [...state.marks, point] : [point];
-  if (state.marks.length === 2) measured();
-  else told(t('measure.second'));
+  state.marks = [...state.marks, point];
+  measured();
   invalidate();
 }
 
-// Says the length between the two points, and asks for the true one.
+// Says the lengths, area and height of the points that are marked, and asks for the true length
+// between two.
 function measured() {
-  const { id } = state.scene,
-    units = length(add(...state.marks, -1));
-  told(t(metres.of(id) ? 'measure.is' : 'measure.units', { length: lengthOf(units) }));
+  const { marks } = state,
+    legs = marks.slice(1).map((mark, i) => length(add(mark, marks[i], -1))),
+    units = legs.reduce((sum, leg) => sum + leg, 0),
+    high = heightOf(marks.at(-1)),
+    says = [];
+  if (marks.length === 1) says.push(t('measure.second'));
+  else if (marks.length > 2) {
+    says.push(t('measure.path', { length: lengthOf(units), area: lengthOf(areaOf(marks), 2) }));
+  } else {
+    says.push(t(metresKnown() ? 'measure.is' : 'measure.units', { length: lengthOf(units) }));
+  }
+  if (high !== null) says.push(t('measure.high', { height: lengthOf(high) }));
+  told(says.join(' '));
+  if (marks.length !== 2) return;
   const truth = make('input', { type: 'number', min: 0, step: 'any' });
-  truth.onchange = () => {
-    metres.give(id, Number(truth.value) / units);
-    measured();
-    remember();
-  };
+  truth.onchange = () => giveLength(Number(truth.value), units).catch(failed);
   $('picked').append(' ', make('label', {}, t('measure.truth'), ' ', truth, ' m'));
+}
+
+// Keeps that so many units of the scene are a length in metres: with the scene, and in this browser
+// where the scene is a file or its server takes no changes.
+async function giveLength(truth, units) {
+  const { id } = state.scene,
+    here = () => metres.give(id, truth / units);
+  if (state.alone) here();
+  else {
+    const body = JSON.stringify(truth ? { metres: truth, points: state.marks } : {}),
+      put = server.json(`/v1/scenes/${id}/scale`, { method: 'PUT', body });
+    const kept = await put.catch((error) => {
+      if (error.status !== 403) throw error;
+      here();
+    });
+    if (kept && state.scene.id === id) takeScale(kept);
+  }
+  measured();
+  remember();
+}
+
+// Area of the polygon of some points, squared units.
+function areaOf(marks) {
+  const sides = marks.map((mark, i) => {
+    const next = marks[(i + 1) % marks.length];
+    return cross(add(mark, marks[0], -1), add(next, marks[0], -1));
+  });
+  return 0.5 * length(sides.reduce((sum, side) => add(sum, side)));
+}
+
+// What the server knows of the size of the scene and of its ground.
+async function readScale(id) {
+  const scale = await server.json(`/v1/scenes/${id}/scale`).catch(() => null);
+  if (state.scene?.id === id) takeScale(scale);
+}
+
+function takeScale(scale) {
+  state.scale = scale;
+  if (scale) state.upright = scale.up;
+  $('ground').hidden = !scale?.ground;
+  const says = {
+    none: t('scale.none'),
+    capture: t('scale.capture'),
+    given: t('scale.given'),
+  };
+  $('scale-says').textContent = says[scale?.source || 'none'];
+  invalidate();
 }
 
 // ---- words ------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ function bindTools() {
     invalidate();
   };
   $('frusta').onclick = ready(() => press('frusta', 'frusta'));
+  $('ground').onclick = ready(() => press('ground', 'ground'));
   $('measure').onclick = ready(() => press('measure', 'measuring'));
   $('save').onclick = ready(() => {
     state.kept.push(state.camera);

@@ -205,6 +205,7 @@ async function open(id, camera, words = []) {
   await load(id, camera, isGrowing && scene.report.gaussians <= COMPARED);
   about(scene);
   await readEdits(id);
+  readScale(id);
   if (isGrowing) followVersions(id, scene.version, signal).catch(() => {});
   for (const b of $('scenes').querySelectorAll('button[data-id]'))
     b.setAttribute('aria-current', String(b.dataset.id === id));
@@ -216,6 +217,7 @@ function forget() {
   Object.assign(state, { words: [], known: [], kept: [], marks: [], things: 0 });
   versions.forget();
   edits.forget();
+  takeScale(null);
   for (const id of ['words', 'picked', 'stops']) $(id).replaceChildren();
   showKept();
 }

@@ -40,6 +40,9 @@ const state = {
   embedded: false,
   version: 0,
   understood: false,
+  // What the server says of metres, up and ground; whether the ground is shown.
+  scale: null,
+  ground: false,
   upright: null,
   filming: null,
 };
@@ -115,11 +118,20 @@ class Kept {
 const names = new Kept('names'),
   metres = new Kept('metres');
 
-// Metres a unit; 1 where no true length was given.
-const metre = () => Number(metres.of(state.scene.id)) || 1;
-// A length of the scene as it is said: in metres where a true length was given.
-const lengthOf = (units) =>
-  `${(units * metre()).toPrecision(3)}${metres.of(state.scene.id) ? ' m' : ''}`;
+// Metres a unit, by the server or by this browser; 0 where no true length is known.
+const metresKnown = () =>
+  state.scale?.metres_per_unit || Number(metres.of(state.scene.id)) || 0;
+const metre = () => metresKnown() || 1;
+// A length of the scene as it is said: in metres where a true length is known; an area likewise.
+const lengthOf = (units, power = 1) =>
+  `${(units * metre() ** power).toPrecision(3)}${
+    metresKnown() ? [' m', ' m²'][power - 1] : ['', '²'][power - 1]
+  }`;
+// How far over the ground a point is, in units; null where no ground is known.
+const heightOf = (point) => {
+  const ground = state.scale?.ground;
+  return ground ? dot(ground.normal, add(point, ground.point, -1)) : null;
+};
 
 // ---- the link ---------------------------------------------------------------------------------
 // The scene, its name, the pose, the words and the picture are in the fragment, which no server
@@ -130,7 +142,7 @@ function fragment() {
   if (!state.alone) {
     parts.set('scene', state.scene.id);
     if (names.of(state.scene.id)) parts.set('name', names.of(state.scene.id));
-    if (metres.of(state.scene.id)) parts.set('metre', metre().toPrecision(6));
+    if (metresKnown()) parts.set('metre', metre().toPrecision(6));
   }
   parts.set('pose', [...eye, ...target, ...up, fov].map((v) => Number(v.toPrecision(9))).join(','));
   for (const text of textsShown()) parts.append('text', text);

@@ -87,8 +87,7 @@ async function followChange(told) {
     path = `/v1/scenes/${encodeURIComponent(id)}`,
     before = state.scene.cameras.length;
   while (told.growth.state === 'running') {
-    if (told.growth.stage) progress({ ...told.growth, event: 'running' });
-    await new Promise((resolve) => setTimeout(resolve, 300));
+    await server.watch(id, progress, signal);
     told = await server.json(path, { signal });
   }
   step.end();

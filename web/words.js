@@ -28,11 +28,11 @@ const TABLE = {
   ],
   drop: ['Drop anything here', 'Legen Sie hier alles ab', '把任何内容拖到这里'],
   'drop.more': [
-    'photos, alone or with their cameras; the folder of a capture (COLMAP, Polycam, Record3D and ' +
-      'others), or one zip; or a file of Gaussians',
-    'Fotos, allein oder mit ihren Kameras; den Ordner einer Aufnahme (COLMAP, Polycam, Record3D ' +
+    'photos, alone or with their cameras; a video; the folder of a capture (COLMAP, Polycam, ' +
+      'Record3D and others), or one zip; or a file of Gaussians',
+    'Fotos, allein oder mit ihren Kameras; ein Video; den Ordner einer Aufnahme (COLMAP, Polycam, Record3D ' +
       'und andere) oder ein Zip; oder eine Datei mit Gauß-Splats',
-    '照片（可附相机参数）；采集文件夹（COLMAP、Polycam、Record3D 等）或一个 zip；或高斯文件',
+    '照片（可附相机参数）；视频；采集文件夹（COLMAP、Polycam、Record3D 等）或一个 zip；或高斯文件',
   ],
   files: ['Choose files', 'Dateien wählen', '选择文件'],
   folder: ['Choose a folder', 'Ordner wählen', '选择文件夹'],
@@ -90,6 +90,27 @@ const TABLE = {
     '{n} Foto ist fehlerhaft; nichts wurde gesendet.|{n} Fotos sind fehlerhaft; nichts wurde ' +
       'gesendet.',
     '{n} 张照片有误；没有发送任何内容。',
+  ],
+  'video.looking': [
+    'looking at the video: {percent} % …',
+    'das Video wird angesehen: {percent} % …',
+    '正在查看视频：{percent} %…',
+  ],
+  'video.taking': [
+    'taking frame {i} of {all} …',
+    'Bild {i} von {all} wird entnommen …',
+    '正在提取第 {i} / {all} 帧…',
+  ],
+  'video.taken': [
+    '{n} frames of {name}: the sharpest, spread over the motion of the camera.',
+    '{n} Bilder aus {name}: die schärfsten, verteilt über die Bewegung der Kamera.',
+    '从 {name} 取 {n} 帧：最清晰的，按相机运动均匀分布。',
+  ],
+  'video.unread': [
+    '{name}: this browser cannot play it. Save it as MP4 (H.264) or WebM, or give its frames.',
+    '{name}: Dieser Browser kann es nicht abspielen. Speichern Sie es als MP4 (H.264) oder WebM, ' +
+      'oder geben Sie seine Bilder.',
+    '{name}：浏览器无法播放。请另存为 MP4（H.264）或 WebM，或提供其画面。',
   ],
   'photos.none': [
     'No photos: add PNG, JPEG or WebP files.',
@@ -313,6 +334,32 @@ const TABLE = {
     '{length} Einheiten der Aufnahme zwischen den beiden Punkten.',
     '两点之间为 {length} 个采集单位。',
   ],
+  'measure.path': [
+    '{length} along the points, {area} between them.',
+    '{length} entlang der Punkte, {area} dazwischen.',
+    '沿各点为 {length}，围成 {area}。',
+  ],
+  'measure.high': [
+    'The last one is {height} over the ground.',
+    'Der letzte liegt {height} über dem Boden.',
+    '最后一点离地 {height}。',
+  ],
+  ground: ['Ground', 'Boden', '地面'],
+  'scale.none': [
+    'Lengths are in units of the capture: measure one and say its true length.',
+    'Längen sind in Einheiten der Aufnahme: Messen Sie eine und geben Sie ihre wahre Länge an.',
+    '长度以采集单位表示：测量一段并输入其实际长度。',
+  ],
+  'scale.capture': [
+    'Lengths are in metres, as the capture measured them.',
+    'Längen sind in Metern, wie die Aufnahme sie gemessen hat.',
+    '长度以米为单位，由采集程序测得。',
+  ],
+  'scale.given': [
+    'Lengths are in metres, by the length that was given.',
+    'Längen sind in Metern, nach der Länge, die angegeben wurde.',
+    '长度以米为单位，依据给定的长度。',
+  ],
   'measure.truth': ['In truth it is', 'In Wahrheit sind es', '实际长度为'],
 
   // Edits.
@@ -334,6 +381,12 @@ const TABLE = {
     '其后方未被拍到：照片中有 {share} % 现在没有内容。',
   ],
   'edits.box': ['Box', 'Quader', '框'],
+  'edits.floaters': ['Clean', 'Säubern', '清理'],
+  'edits.floaters.title': [
+    'Delete floaters: what no photo confirms and several see through',
+    'Schwebendes löschen: was kein Foto bestätigt und mehrere durchschauen',
+    '删除漂浮物：没有照片证实且多张照片看穿的部分',
+  ],
   'edits.up': ['Apply edit {n} earlier', 'Änderung {n} früher anwenden', '提前应用编辑 {n}'],
   'edits.down': ['Apply edit {n} later', 'Änderung {n} später anwenden', '推后应用编辑 {n}'],
   'edits.away': ['Take back edit {n}', 'Änderung {n} zurücknehmen', '撤回编辑 {n}'],
@@ -348,6 +401,7 @@ const TABLE = {
   'edit.of.pick': ['a clicked thing', 'ein angeklicktes Ding', '点选的物体'],
   'edit.of.box': ['a box', 'ein Quader', '一个框'],
   'edit.of.sphere': ['a ball', 'eine Kugel', '一个球'],
+  'edit.of.floaters': ['floaters', 'Schwebendes', '漂浮物'],
   'act.on': ['Edit {text}', '{text} ändern', '编辑 {text}'],
   'act.parts': ['Which part', 'Welcher Teil', '哪一处'],
   'act.all': ['all of it', 'alles', '全部'],

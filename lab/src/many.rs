@@ -28,7 +28,7 @@ use crate::{
         train::{pose::moved, unit},
     },
     rows::{Rows, ms, progress},
-    scene::{Camera, CameraToWorld, Gaussians, PosedPhoto, Scene, SceneOptions},
+    scene::{Camera, CameraToWorld, Gaussians, PosedPhoto, Scene, SceneOptions, floaters},
     scenes::{
         SILENT, is_posed, make_for_refinement, make_keeping, make_more, recast, scene_of, spread,
         use_of, view_request,
@@ -59,6 +59,10 @@ pub(crate) struct Args {
     /// So many of the given photos join the scene of all others: how good it is before and after
     #[arg(long, conflicts_with_all = ["refine", "disturb"])]
     join: Option<usize>,
+    /// What is left of the scene without its floaters, and of the scene with so many more of them:
+    /// a share of its Gaussians
+    #[arg(long, value_name = "SHARE", conflicts_with_all = ["refine", "disturb", "join"])]
+    floaters: Option<f64>,
     /// Also with cut-outs of this tar (`images/`, `masks/`) pasted into every third given photo
     #[arg(long, value_name = "TAR")]
     paste: Option<PathBuf>,
@@ -98,6 +102,13 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             let row = json!({ "scene": name, "use": use_of(&name), "joined": row });
             progress(&row.to_string());
             rows.push(json!({ "psnr_db": row["joined"]["psnr"] }), row)?;
+            continue;
+        }
+        if let Some(share) = args.floaters {
+            let row = cleaned(&engine, &*renderer, &right, share, &scene_options, &targets)?;
+            let row = json!({ "scene": name, "use": use_of(&name), "cleaned": row });
+            progress(&row.to_string());
+            rows.push(json!({ "psnr_db": row["cleaned"]["psnr"] }), row)?;
             continue;
         }
         let wrong = args.disturb.as_deref().map(|at| [at[0], at[1]]);
@@ -324,6 +335,62 @@ fn joining(
         "psnr_at_once": mean(&anew),
         "made_ms": made_ms,
         "join_ms": join_ms,
+    }))
+}
+
+/// A scene without its floaters, and one with `share` of its Gaussians more that float, before and
+/// after: PSNR at the targets, and which of the added ones are taken.
+fn cleaned(
+    engine: &Pipeline,
+    renderer: &dyn Renderer,
+    photos: &[PosedPhoto],
+    share: f64,
+    options: &SceneOptions,
+    targets: &[PosedPhoto],
+) -> Result<Value> {
+    let scene = scene_of(make_keeping(engine, photos, options)?.0);
+    let judge = |gaussians: &Gaussians| {
+        let scene = Scene { gaussians: gaussians.clone(), ..scene.clone() };
+        mean_psnr(targets, |camera| {
+            let plain = view_request(camera, Kinds::COLOR, scene.meta.report.median_depth);
+            renderer.render(&scene.gaussians, &served(&scene, plain))
+        })
+    };
+    let cameras = &scene.meta.cameras;
+    let begun = Instant::now();
+    let found = floaters(&scene.gaussians, cameras);
+    let clean_ms = ms(begun);
+    let clean = scene.gaussians.only(|i| !found[i]);
+    // Drawn ones come nearer to the photo that gave them, along their rays.
+    let mut random = Random(17);
+    let (count, origin) = (scene.gaussians.len(), scene.gaussians.origin());
+    let drawn: Vec<bool> = (0..count).map(|_| f64::from(random.range(0.0, 1.0)) < share).collect();
+    let mut more = scene.gaussians.only(|i| drawn[i]).into_raw();
+    for ((mean, source), scales) in more.means.iter_mut().zip(&more.source).zip(&mut more.scales) {
+        let eye = cameras[usize::from(source.view)].camera.camera_to_world.center() - origin;
+        let at = f64::from(random.range(0.25, 0.75));
+        let place = eye + at * (DVec3::from(mean.map(f64::from)) - eye);
+        *mean = place.as_vec3().to_array();
+        let scale = f64::from(random.range(1.0, 4.0)) * at;
+        *scales = scales.map(|v| (f64::from(v) * scale) as f32);
+    }
+    let added = more.means.len();
+    let dirty = scene.gaussians.joined(&Gaussians::restore(more)?)?;
+    let floating = floaters(&dirty, cameras);
+    let cleaned = dirty.only(|i| !floating[i]);
+    let taken = floating[count..].iter().filter(|is| **is).count();
+    Ok(json!({
+        "photos": photos.len(),
+        "gaussians": count,
+        "floaters": found.iter().filter(|is| **is).count(),
+        "clean_ms": clean_ms,
+        "psnr_before": judge(&scene.gaussians)?,
+        "psnr": judge(&clean)?,
+        "added": added,
+        "added_taken": taken,
+        "own_taken": floating[..count].iter().filter(|is| **is).count(),
+        "psnr_dirty": judge(&dirty)?,
+        "psnr_cleaned": judge(&cleaned)?,
     }))
 }
 

@@ -1046,6 +1046,9 @@ pub struct CamerasReport {
     /// Photos that are no part of the scene, since their cameras could not be solved.
     #[prost(message, repeated, tag = "4")]
     pub left_out: ::prost::alloc::vec::Vec<LeftOutPhoto>,
+    /// What a unit of the world is, as far as the capture says.
+    #[prost(enumeration = "LengthUnit", tag = "5")]
+    pub unit: i32,
 }
 /// A photo whose camera was solved.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -1301,6 +1304,108 @@ pub struct SceneEdits {
     /// behind a thing that is gone.
     #[prost(double, tag = "4")]
     pub uncovered: f64,
+}
+/// Whose scale.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct GetScaleRequest {
+    /// Id.
+    #[prost(string, tag = "1")]
+    pub scene_id: ::prost::alloc::string::String,
+}
+/// How large a scene is: metres with either points or thing, or metres_per_unit. Nothing: as the
+/// capture says it.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct SetScaleRequest {
+    /// Id.
+    #[prost(string, tag = "1")]
+    pub scene_id: ::prost::alloc::string::String,
+    /// A length, metres.
+    #[prost(double, optional, tag = "2")]
+    pub metres: ::core::option::Option<f64>,
+    /// It is that between these two points of the world: x, y, z of one, then of the other.
+    #[prost(double, repeated, tag = "3")]
+    pub points: ::prost::alloc::vec::Vec<f64>,
+    /// It is that of a side of this thing.
+    #[prost(message, optional, tag = "4")]
+    pub thing: ::core::option::Option<ScaleThing>,
+    /// Metres of a unit of the world.
+    #[prost(double, optional, tag = "5")]
+    pub metres_per_unit: ::core::option::Option<f64>,
+    /// Milliseconds to wait for semantics that are being made.
+    #[prost(uint64, optional, tag = "6")]
+    pub semantics_wait_ms: ::core::option::Option<u64>,
+}
+/// A thing whose size is known.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ScaleThing {
+    /// The text that finds it.
+    #[prost(string, tag = "1")]
+    pub text: ::prost::alloc::string::String,
+    /// Which of the parts that the text finds, counted from 0 in a query's order.
+    #[prost(uint32, tag = "2")]
+    pub part: u32,
+    /// Which side of the part's upright box.
+    #[prost(enumeration = "BoxSide", tag = "3")]
+    pub side: i32,
+}
+/// A plane that things stand on.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Ground {
+    /// Up, a unit vector.
+    #[prost(double, repeated, tag = "1")]
+    pub normal: ::prost::alloc::vec::Vec<f64>,
+    /// A point of it, in the middle of what was seen of it; world units.
+    #[prost(double, repeated, tag = "2")]
+    pub point: ::prost::alloc::vec::Vec<f64>,
+    /// Share of the scene's Gaussians that lie on it, 0 to 1.
+    #[prost(double, tag = "3")]
+    pub share: f64,
+}
+/// What is known of how large a scene is and how it stands.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct SceneScale {
+    /// Metres of a unit of the world, where they are known.
+    #[prost(double, optional, tag = "1")]
+    pub metres_per_unit: ::core::option::Option<f64>,
+    /// Where they come from.
+    #[prost(enumeration = "ScaleSource", tag = "2")]
+    pub source: i32,
+    /// Up, a unit vector of the world: the ground's, else as the photos tell it.
+    #[prost(double, repeated, tag = "3")]
+    pub up: ::prost::alloc::vec::Vec<f64>,
+    /// The ground, where one was found in the scene as it was made.
+    #[prost(message, optional, tag = "4")]
+    pub ground: ::core::option::Option<Ground>,
+}
+/// Points of a scene.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct MeasureRequest {
+    /// Id.
+    #[prost(string, tag = "1")]
+    pub scene_id: ::prost::alloc::string::String,
+    /// 1 to 64 points of the world, in the order in which they are joined: x, y, z of each.
+    #[prost(double, repeated, tag = "2")]
+    pub points: ::prost::alloc::vec::Vec<f64>,
+}
+/// Lengths between points of a scene.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Measured {
+    /// Unit of the lengths; areas are in its square. Where metres are not known: that of the world.
+    #[prost(enumeration = "LengthUnit", tag = "1")]
+    pub unit: i32,
+    /// From the first point to the last, by way of all others.
+    #[prost(double, tag = "2")]
+    pub length: f64,
+    /// From each point to the next one.
+    #[prost(double, repeated, tag = "3")]
+    pub legs: ::prost::alloc::vec::Vec<f64>,
+    /// Area of the polygon of the points, in the plane that it fills most of; of three points and
+    /// more.
+    #[prost(double, optional, tag = "4")]
+    pub area: ::core::option::Option<f64>,
+    /// Of each point over the ground; none where no ground was found.
+    #[prost(double, repeated, tag = "5")]
+    pub heights: ::prost::alloc::vec::Vec<f64>,
 }
 /// One view.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -1956,6 +2061,117 @@ impl CamerasSource {
         }
     }
 }
+/// A side of the upright box of a thing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum BoxSide {
+    /// As BOX_SIDE_HEIGHT.
+    Unspecified = 0,
+    /// Along up.
+    Height = 1,
+    /// The longer one of the other two.
+    Width = 2,
+    /// The shorter one of them.
+    Depth = 3,
+    /// The longest of all three.
+    Longest = 4,
+}
+impl BoxSide {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "BOX_SIDE_UNSPECIFIED",
+            Self::Height => "BOX_SIDE_HEIGHT",
+            Self::Width => "BOX_SIDE_WIDTH",
+            Self::Depth => "BOX_SIDE_DEPTH",
+            Self::Longest => "BOX_SIDE_LONGEST",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "BOX_SIDE_UNSPECIFIED" => Some(Self::Unspecified),
+            "BOX_SIDE_HEIGHT" => Some(Self::Height),
+            "BOX_SIDE_WIDTH" => Some(Self::Width),
+            "BOX_SIDE_DEPTH" => Some(Self::Depth),
+            "BOX_SIDE_LONGEST" => Some(Self::Longest),
+            _ => None,
+        }
+    }
+}
+/// Where the metres of a scene come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum ScaleSource {
+    /// Not said.
+    Unspecified = 0,
+    /// They are not known.
+    None = 1,
+    /// The program that took the photos measures in metres.
+    Capture = 2,
+    /// A call gave them.
+    Given = 3,
+}
+impl ScaleSource {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "SCALE_SOURCE_UNSPECIFIED",
+            Self::None => "SCALE_SOURCE_NONE",
+            Self::Capture => "SCALE_SOURCE_CAPTURE",
+            Self::Given => "SCALE_SOURCE_GIVEN",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "SCALE_SOURCE_UNSPECIFIED" => Some(Self::Unspecified),
+            "SCALE_SOURCE_NONE" => Some(Self::None),
+            "SCALE_SOURCE_CAPTURE" => Some(Self::Capture),
+            "SCALE_SOURCE_GIVEN" => Some(Self::Given),
+            _ => None,
+        }
+    }
+}
+/// What a unit of the world is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum LengthUnit {
+    /// Not said.
+    Unspecified = 0,
+    /// Nobody said.
+    Unknown = 1,
+    /// A metre.
+    Metre = 2,
+}
+impl LengthUnit {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "LENGTH_UNIT_UNSPECIFIED",
+            Self::Unknown => "LENGTH_UNIT_UNKNOWN",
+            Self::Metre => "LENGTH_UNIT_METRE",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "LENGTH_UNIT_UNSPECIFIED" => Some(Self::Unspecified),
+            "LENGTH_UNIT_UNKNOWN" => Some(Self::Unknown),
+            "LENGTH_UNIT_METRE" => Some(Self::Metre),
+            _ => None,
+        }
+    }
+}
 /// Which picture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
@@ -2490,6 +2706,72 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("segsplat.v1.SceneService", "SetEdits"));
             self.inner.unary(req, path, codec).await
         }
+        /// How large a scene is: metres, up and the ground.
+        pub async fn get_scale(
+            &mut self,
+            request: impl tonic::IntoRequest<super::GetScaleRequest>,
+        ) -> std::result::Result<tonic::Response<super::SceneScale>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/segsplat.v1.SceneService/GetScale",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("segsplat.v1.SceneService", "GetScale"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Says how large a scene is: by two points and a length, by a thing, or by metres a unit.
+        pub async fn set_scale(
+            &mut self,
+            request: impl tonic::IntoRequest<super::SetScaleRequest>,
+        ) -> std::result::Result<tonic::Response<super::SceneScale>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/segsplat.v1.SceneService/SetScale",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("segsplat.v1.SceneService", "SetScale"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Lengths, area and heights over the ground of points of a scene.
+        pub async fn measure(
+            &mut self,
+            request: impl tonic::IntoRequest<super::MeasureRequest>,
+        ) -> std::result::Result<tonic::Response<super::Measured>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/segsplat.v1.SceneService/Measure",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("segsplat.v1.SceneService", "Measure"));
+            self.inner.unary(req, path, codec).await
+        }
         /// One rendered view.
         pub async fn render_view(
             &mut self,
@@ -2734,6 +3016,21 @@ pub mod scene_service_server {
             &self,
             request: tonic::Request<super::SetEditsRequest>,
         ) -> std::result::Result<tonic::Response<super::SceneEdits>, tonic::Status>;
+        /// How large a scene is: metres, up and the ground.
+        async fn get_scale(
+            &self,
+            request: tonic::Request<super::GetScaleRequest>,
+        ) -> std::result::Result<tonic::Response<super::SceneScale>, tonic::Status>;
+        /// Says how large a scene is: by two points and a length, by a thing, or by metres a unit.
+        async fn set_scale(
+            &self,
+            request: tonic::Request<super::SetScaleRequest>,
+        ) -> std::result::Result<tonic::Response<super::SceneScale>, tonic::Status>;
+        /// Lengths, area and heights over the ground of points of a scene.
+        async fn measure(
+            &self,
+            request: tonic::Request<super::MeasureRequest>,
+        ) -> std::result::Result<tonic::Response<super::Measured>, tonic::Status>;
         /// One rendered view.
         async fn render_view(
             &self,
@@ -3308,6 +3605,141 @@ pub mod scene_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = SetEditsSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/segsplat.v1.SceneService/GetScale" => {
+                    #[allow(non_camel_case_types)]
+                    struct GetScaleSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::UnaryService<super::GetScaleRequest>
+                    for GetScaleSvc<T> {
+                        type Response = super::SceneScale;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::GetScaleRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::get_scale(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = GetScaleSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/segsplat.v1.SceneService/SetScale" => {
+                    #[allow(non_camel_case_types)]
+                    struct SetScaleSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::UnaryService<super::SetScaleRequest>
+                    for SetScaleSvc<T> {
+                        type Response = super::SceneScale;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::SetScaleRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::set_scale(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = SetScaleSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/segsplat.v1.SceneService/Measure" => {
+                    #[allow(non_camel_case_types)]
+                    struct MeasureSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::UnaryService<super::MeasureRequest>
+                    for MeasureSvc<T> {
+                        type Response = super::Measured;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::MeasureRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::measure(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = MeasureSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

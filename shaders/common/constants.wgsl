@@ -38,6 +38,9 @@ const GROUPS_X_MAX: u32 = 32768u;
 // Values of View::levels but 0.
 const LEVELS_RGB: u32 = 1u;
 const LEVELS_RGBA: u32 = 2u;
+// Values of Source::layer but 0.
+const BEHIND: u32 = 1u;
+const LEFT_OUT: u32 = 2u;
 // Sums that a tile gives for each of its pairs in the backward pass.
 const PAIR_SUMS: u32 = 10u;
 // Derivatives of a Gaussian but for its harmonics, and whether it is seen.

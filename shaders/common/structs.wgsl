@@ -97,8 +97,8 @@ struct Source {
     scale: f32,
     // Axis of the camera.
     axis: vec3<f32>,
-    // Not 0: its Gaussians are behind all of the others.
-    behind: u32,
+    // BEHIND, LEFT_OUT, or 0: its Gaussians are in front.
+    layer: u32,
 }
 
 // Gaussians that are close together.

@@ -15,6 +15,7 @@ mod features;
 mod health;
 mod inspect;
 mod keys;
+mod measure;
 mod models;
 mod output;
 mod query;
@@ -73,6 +74,8 @@ enum Command {
     Query(Box<query::Args>),
     /// Write a scene after a list of edits: delete, keep, move, copy, recolour
     Edit(edit::Args),
+    /// Measure a scene: metres, up, ground, distances, areas and heights
+    Measure(measure::Args),
     /// Write the bank of a scene, or the pixels of a view over it, as an npz file
     Features(Box<features::Args>),
     /// Write a scene for other programs: Gaussians, or a folder with photos and depth or masks
@@ -99,6 +102,7 @@ impl Command {
             Self::Render(args) => common(&args.config),
             Self::Query(args) => common(&args.config),
             Self::Edit(args) => common(&args.config),
+            Self::Measure(args) => common(&args.config),
             Self::Features(args) => common(&args.config),
             Self::Models(args) => common(&args.config),
             Self::Bench(args) => common(&args.config),
@@ -172,6 +176,7 @@ fn dispatch(cli: &Cli, out: &Output) -> Result<()> {
         Command::Render(args) => render::run(args, &config, out),
         Command::Query(args) => query::run(args, &config, out),
         Command::Edit(args) => edit::run(args, &config, out),
+        Command::Measure(args) => measure::run(args, &config, out),
         Command::Features(args) => features::run(args, &config, out),
         Command::Export(args) => export::run(args, &config, out),
         Command::Inspect(args) => inspect::run(args, &config, out),

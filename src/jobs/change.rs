@@ -199,9 +199,8 @@ fn grown(record: &mut Record, scene: &Scene, order: Option<RefineOrder>) {
     record.content_sha256 = Some(scene.meta.provenance.content_sha256.clone());
     record.status.version += 1;
     record.growth.attempts = 0;
-    if let Some(PhotoChange::Add(added)) = record.growth.waiting.pop_front() {
-        record.growth.joined.push(added);
-    }
+    let change = record.growth.waiting.pop_front();
+    record.growth.done(change, &scene.meta.cameras);
     record.status.growth = GrowthStatus::of(waiting(record));
     if record.growth.waiting.is_empty() {
         record.growth.refine = None;

@@ -250,6 +250,19 @@ impl Jobs {
         }
     }
 
+    /// Forgets uploads of which a change has left the scene no photo. One that a kill spares here
+    /// goes with the scene.
+    fn drop_gone(&self, grown: &Changed) {
+        let id = &grown.after.status.id;
+        for object in grown.before.growth.objects() {
+            if !grown.after.growth.objects().any(|kept| kept == object)
+                && let Err(error) = self.parts.store.drop_added(id, object)
+            {
+                tracing::warn!(scene = %id, %error, "photos that nothing needs are still kept");
+            }
+        }
+    }
+
     /// Queues the next change after a job of this kind.
     pub(super) fn go_on_growing(&self, job: &Job) {
         if job.kind == GROW && !self.end_growing(&job.scene) {
@@ -297,7 +310,9 @@ impl Jobs {
         if let Some(labelled) = labelled {
             self.uploads.keep_labelled(id, labelled);
         }
-        let grown = self.records.apply(id, &Change::Grown(&scene, order))?.after;
+        let grown = self.records.apply(id, &Change::Grown(&scene, order))?;
+        self.drop_gone(&grown);
+        let grown = grown.after;
         let (version, photos) = (grown.status.version, scene.meta.cameras.len());
         tracing::info!(scene = %id, version, photos, "its photos changed");
         if grown.refine.is_some() {
@@ -399,12 +414,13 @@ impl Jobs {
             return Ok(read);
         }
         let mut all = read.photos()?.clone();
-        for added in &record.growth.joined {
+        let lacks = || Error::internal(format!("a photo of scene {id} is not in its uploads"));
+        for added in record.growth.joined.iter().filter(|added| !added.files.is_empty()) {
             let (new, _) = self.read_added(id, added, all.photos.len(), watch)?;
+            let new = new.only(added.files.iter().map(String::as_str)).ok_or_else(lacks)?;
             all = all.joined(new);
         }
         let photos = all.only(cameras.iter().map(|camera| &*camera.file));
-        let lacks = || Error::internal(format!("a photo of scene {id} is not in its uploads"));
         Ok(read.with_photos(photos.ok_or_else(lacks)?))
     }
 
@@ -455,6 +471,13 @@ fn changed_provenance(
             format!("without {gone}")
         }
     };
+    // Each call has a file of cameras: the first and the newest of a name stay.
+    for hash in &hashes {
+        let mut same = (0..files.len()).filter(|&i| files[i].file == hash.file);
+        if let (Some(_), Some(old)) = (same.next(), same.next()) {
+            files.remove(old);
+        }
+    }
     files.extend(hashes);
     let content_sha256 = store::sha256(format!("{} {what}", before.content_sha256).as_bytes());
     Provenance { files, content_sha256, ..before.clone() }

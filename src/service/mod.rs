@@ -19,6 +19,7 @@ mod pick;
 mod query;
 mod refine;
 mod request;
+mod scale;
 mod scenes;
 mod schedule;
 mod search;
@@ -33,7 +34,7 @@ mod view;
 mod words;
 mod work;
 
-pub(crate) use self::{create::checked_words, refine::check_refine};
+pub(crate) use self::{create::checked_words, refine::check_refine, request::numbers};
 pub use self::{
     edits::{EditBox, EditOp, EditPick, EditSelection, EditSpec, EditSphere, SceneEdits},
     export::scene_splats,
@@ -48,6 +49,7 @@ pub use self::{
         PictureOptions, PoseSpec, QuerySpec, ScoringOptions, TextOptions, ViewOptions, ViewSpec,
         ViewsSpec,
     },
+    scale::{BoxSide, Measured, ScaleSource, ScaleSpec, ScaleThing, SceneScale},
     shared::{Parts, Service},
     times::ViewTimes,
     types::{

@@ -29,6 +29,7 @@ const SCRIPT: &str = concat!(
     include_str!("../../web/draw.js"),
     include_str!("../../web/film.js"),
     include_str!("../../web/server.js"),
+    include_str!("../../web/video.js"),
     include_str!("../../web/capture.js"),
     include_str!("../../web/state.js"),
     include_str!("../../web/canvas.js"),
@@ -78,7 +79,7 @@ fn policy(connect: &str) -> String {
     let (script, style) = (hash(SCRIPT), hash(STYLE));
     format!(
         "default-src 'none'; script-src {script}; style-src {style}; worker-src blob:; \
-         img-src 'self' blob: data:; connect-src {connect}; base-uri 'none'"
+         img-src 'self' blob: data:; media-src blob:; connect-src {connect}; base-uri 'none'"
     )
 }
 

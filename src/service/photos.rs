@@ -44,8 +44,8 @@ impl Service {
     }
 
     /// Takes a photo out of a finished scene, and waits for the version without it as long as the
-    /// caller wants. Its file stays in the store, with those that came with it, until the scene is
-    /// deleted.
+    /// caller wants. Its file stays in the store as long as a photo that came with it is there; of
+    /// the create call until the scene is deleted.
     ///
     /// # Errors
     /// `scene_not_found`, `scene_not_ready`; `not_found` where the scene has no such photo;

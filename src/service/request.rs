@@ -667,7 +667,9 @@ impl<'de> Deserialize<'de> for BackgroundSpec {
 }
 
 /// Exactly `N` numbers, separated by commas.
-fn numbers<T: FromStr + Copy + Default, const N: usize>(text: &str) -> Result<[T; N], String> {
+pub(crate) fn numbers<T: FromStr + Copy + Default, const N: usize>(
+    text: &str,
+) -> Result<[T; N], String> {
     let count = text.split(',').count();
     if count != N {
         return Err(format!("{count} numbers, not {N}"));

@@ -7,6 +7,7 @@
 //! scenes/ID/scene.segsplat      the finished scene
 //! scenes/ID/semantics.segsplat  its semantics, once a text needed them
 //! scenes/ID/edits.json          its list of edits, once there was one
+//! scenes/ID/scale.json          metres of a unit of it, where a call said them
 //! scenes/ID/status.json         the record of what is over: done or failed
 //! scenes/ID/*.quarantined       an object that failed its checksum
 //! pending/ID                    the record of what is not over; gone soon after there is a status
@@ -65,6 +66,7 @@ use crate::{
 pub(crate) const UPLOAD: &str = "upload.segsplat";
 const STATUS: &str = "status.json";
 const EDITS: &str = "edits.json";
+const SCALE: &str = "scale.json";
 const SCENE: &str = "scene.segsplat";
 const SEMANTICS: &str = "semantics.segsplat";
 const PROBE: &str = "probe";

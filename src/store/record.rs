@@ -8,9 +8,12 @@ use crate::{
     error::{Error, ErrorCode, Result},
     formats::container::unread_json,
     names::hex,
-    scene::{GrowthStatus, Refine, SceneOptions, SceneStatus},
+    scene::{GrowthStatus, Refine, SceneCamera, SceneOptions, SceneStatus},
 };
 use sha2::{Digest, Sha256};
+
+/// Idempotency keys of calls whose photos are all gone that a scene remembers.
+const GONE_KEYS_MAX: usize = 64;
 
 /// A refinement that goes on after any restart.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -26,7 +29,8 @@ pub struct RefineOrder {
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Growth {
-    /// Uploads whose photos joined it, in their order.
+    /// Uploads whose photos joined it, in their order; of each the photos that are still there.
+    /// Calls whose photos are all gone have no object any more: see [`Self::done`].
     pub joined: Vec<AddedPhotos>,
     /// What is still to be done, in the order of the calls.
     pub waiting: VecDeque<PhotoChange>,
@@ -52,7 +56,7 @@ pub enum PhotoChange {
 pub struct AddedPhotos {
     /// Name of its object, beside those of the scene.
     pub object: String,
-    /// File names of its photos.
+    /// File names of its photos; once they joined, of those that the scene has.
     pub files: Vec<String>,
     /// Idempotency key of the call.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -72,6 +76,35 @@ impl Growth {
             true => GrowthStatus::default(),
             false => GrowthStatus::of(u32::try_from(self.waiting.len()).unwrap_or(u32::MAX)),
         }
+    }
+
+    /// Notes that a change is done, after which the scene has these cameras. Of calls whose photos
+    /// are all gone the newest [`GONE_KEYS_MAX`] that had a key are known on, so that a call that is
+    /// sent twice does nothing the second time.
+    pub fn done(&mut self, change: Option<PhotoChange>, cameras: &[SceneCamera]) {
+        if let Some(PhotoChange::Add(added)) = change {
+            // A name that comes again is another photo.
+            for before in &mut self.joined {
+                before.files.retain(|file| !added.files.contains(file));
+            }
+            self.joined.push(added);
+        }
+        let is_there = |file: &String| cameras.iter().any(|camera| camera.file == *file);
+        self.joined.iter_mut().for_each(|added| added.files.retain(is_there));
+        let is_key =
+            |added: &AddedPhotos| added.files.is_empty() && added.idempotency_key.is_some();
+        let keys = self.joined.iter().filter(|added| is_key(added)).count();
+        let mut old = keys.saturating_sub(GONE_KEYS_MAX);
+        self.joined.retain(|added| {
+            let is_old = is_key(added) && old > 0;
+            old -= usize::from(is_old);
+            !is_old && (is_key(added) || !added.files.is_empty())
+        });
+    }
+
+    /// Objects whose photos the scene has, or is to have.
+    pub fn objects(&self) -> impl Iterator<Item = &str> {
+        self.added().filter(|added| !added.files.is_empty()).map(|added| &*added.object)
     }
 
     /// The uploads that joined or wait.
@@ -189,4 +222,46 @@ pub(super) fn unseal_text(file: &[u8], what: &str) -> Result<String> {
         return Err(corrupt("its checksum does not match its content".to_owned()));
     }
     Ok(sealed.record)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Camera, CameraToWorld, Intrinsics};
+
+    #[test]
+    fn of_calls_whose_photos_are_gone_the_newest_keys_are_known() {
+        let call = |i: usize, key: bool| AddedPhotos {
+            object: format!("added-{i}"),
+            files: vec![format!("{i}.png"), format!("{i}b.png")],
+            idempotency_key: key.then(|| i.to_string()),
+            request_sha256: i.to_string(),
+        };
+        let intrinsics = Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 1, height: 1 };
+        let pose = [1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1.];
+        let camera_to_world = CameraToWorld::from_row_major(&pose, "test").unwrap();
+        let camera = Camera { intrinsics, camera_to_world };
+        let of = |file: String| SceneCamera { file, camera, network: None };
+        let mut growth = Growth::default();
+        for i in 0..GONE_KEYS_MAX + 6 {
+            // Each photo that comes drives out the one before.
+            let cameras = [of(format!("{i}b.png"))];
+            growth.done(Some(PhotoChange::Add(call(i, i % 3 > 0))), &cameras);
+            growth.done(None, &cameras);
+            assert_eq!(growth.objects().collect::<Vec<_>>(), [format!("added-{i}")]);
+        }
+        let last = growth.joined.last().unwrap();
+        assert_eq!(last.files, [format!("{}b.png", GONE_KEYS_MAX + 5)]);
+        // A photo of a name that was there is another one.
+        let again = AddedPhotos { files: last.files.clone(), ..call(900, true) };
+        let cameras = [of(again.files[0].clone())];
+        growth.done(Some(PhotoChange::Add(again)), &cameras);
+        assert_eq!(growth.objects().collect::<Vec<_>>(), ["added-900"]);
+        for i in 1000..2000 {
+            growth.done(Some(PhotoChange::Add(call(i, true))), &[of(format!("{i}.png"))]);
+        }
+        let keys: Vec<_> = growth.joined.iter().map(|one| one.object.clone()).collect();
+        let newest = 2000 - GONE_KEYS_MAX - 1..2000;
+        assert_eq!(keys, newest.map(|i| format!("added-{i}")).collect::<Vec<_>>());
+    }
 }

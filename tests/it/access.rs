@@ -25,7 +25,7 @@ use crate::common::{
 };
 
 /// Every call, named as the gRPC methods are, and what it needs.
-const CALLS: [(&str, Scope); 17] = [
+const CALLS: [(&str, Scope); 20] = [
     ("CreateScene", Scope::Write),
     ("ListScenes", Scope::Read),
     ("GetScene", Scope::Read),
@@ -35,6 +35,9 @@ const CALLS: [(&str, Scope); 17] = [
     ("RemovePhoto", Scope::Write),
     ("GetEdits", Scope::Read),
     ("SetEdits", Scope::Write),
+    ("GetScale", Scope::Read),
+    ("SetScale", Scope::Write),
+    ("Measure", Scope::Read),
     ("RenderView", Scope::Read),
     ("RenderViews", Scope::Read),
     ("Query", Scope::Read),
@@ -110,6 +113,11 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
                 "SetEdits" => {
                     client.put(format!("{base}/v1/scenes/{id}/edits")).body("{\"edits\":[]}")
                 }
+                "GetScale" => client.get(format!("{base}/v1/scenes/{id}/scale")),
+                "SetScale" => client.put(format!("{base}/v1/scenes/{id}/scale")).body("{}"),
+                "Measure" => client
+                    .post(format!("{base}/v1/scenes/{id}/measure"))
+                    .body("{\"points\":[[0,0,1]]}"),
                 "AddPhotos" => client
                     .post(format!("{base}/v1/scenes/{id}/photos?wait_ms=60000"))
                     .multipart(form(&another())),
@@ -158,6 +166,15 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
                     let edits_json = "[]".into();
                     let none = pb::SetEditsRequest { scene_id, edits_json, ..Default::default() };
                     client.set_edits(none).await.map(drop)
+                }
+                "GetScale" => client.get_scale(pb::GetScaleRequest { scene_id }).await.map(drop),
+                "SetScale" => {
+                    let none = pb::SetScaleRequest { scene_id, ..Default::default() };
+                    client.set_scale(none).await.map(drop)
+                }
+                "Measure" => {
+                    let points = vec![0.0, 0.0, 1.0];
+                    client.measure(pb::MeasureRequest { scene_id, points }).await.map(drop)
                 }
                 "RenderViews" => {
                     let cameras = vec![camera];

@@ -16,7 +16,7 @@ use crate::common::{cpu_server::CpuServer, root};
 type Absent = &'static [(&'static str, &'static str)];
 
 /// Calls on the command line, and its commands.
-const COMMANDS: [(&str, &str); 8] = [
+const COMMANDS: [(&str, &str); 9] = [
     ("add_photos", "add"),
     ("create_scene", "reconstruct"),
     ("render_view", "render"),
@@ -24,6 +24,7 @@ const COMMANDS: [(&str, &str); 8] = [
     ("features", "features"),
     ("export", "export"),
     ("set_edits", "edit"),
+    ("measure", "measure"),
     ("models", "models"),
 ];
 
@@ -52,6 +53,8 @@ const NOT_ON_THE_COMMAND_LINE: Absent = &[
     ("watch_scene", "`reconstruct` shows its progress"),
     ("add_photos.*", "the arguments"),
     ("remove_photo", "files keep no photos; `curl -X DELETE`"),
+    ("get_scale", "`measure` says it too"),
+    ("set_scale", "a file keeps none: `measure --metres` and `--metres-per-unit`"),
     ("get_edits", "a file has no list: `edit` writes what it comes to"),
     ("refine_scene", "`reconstruct --refine`: a file has no photos"),
     ("render_views", "a call of `render` for each camera"),

@@ -202,6 +202,52 @@ async fn a_call_with_a_key_adds_its_photos_once() {
     assert_eq!(told["code"], "idempotency_key_reused");
 }
 
+/// Names of the uploads that are kept beside a scene.
+fn added(server: &TestServer, id: &SceneId) -> Vec<String> {
+    let objects = std::fs::read_dir(server.data_dir().join(format!("scenes/{id}"))).unwrap();
+    let names = objects.map(|object| object.unwrap().file_name().into_string().unwrap());
+    let mut names: Vec<String> = names.filter(|name| name.starts_with("added")).collect();
+    names.sort();
+    names
+}
+
+/// Waits until so many uploads are kept: they go after the version without them is there.
+async fn until_added(server: &TestServer, id: &SceneId, count: usize) -> Vec<String> {
+    eventually("uploads are dropped", async || {
+        Some(added(server, id)).filter(|names| names.len() == count)
+    })
+    .await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn uploads_of_photos_that_left_are_dropped_and_their_calls_are_still_known() {
+    let server = TestServer::start().await;
+    let id = made(&server, &[0, 1, 2], SceneOptions::default()).await.id;
+    let (status, ..) = send(&server, &id, &some(&[3, 4]), 60_000, Some("two")).await;
+    assert_eq!(status, StatusCode::OK);
+    let (status, ..) = send(&server, &id, &some(&[5]), 60_000, Some("one")).await;
+    assert_eq!(status, StatusCode::OK);
+    let both = added(&server, &id);
+    let name = |photo: usize| some(&[photo]).photos[0].name.replace('/', "%2F");
+    assert_eq!(remove(&server, &id, &name(3)).await.0, StatusCode::OK);
+    assert_eq!(remove(&server, &id, &name(5)).await.0, StatusCode::OK);
+    assert_eq!(until_added(&server, &id, 1).await, both[..1], "one of two is still there");
+    // The photos are read again, and of the first upload the one that is there.
+    let server = server.restart().await;
+    let grown = add(&server, &id, &[3]).await;
+    assert_eq!((files(&grown).len(), added(&server, &id).len()), (5, 2));
+    assert_eq!(remove(&server, &id, &name(4)).await.0, StatusCode::OK);
+    until_added(&server, &id, 1).await;
+    let server = server.restart().await;
+    for (photos, key) in [(&[3, 4][..], "two"), (&[5][..], "one")] {
+        let (status, replayed, told) = send(&server, &id, &some(photos), 60_000, Some(key)).await;
+        assert_eq!((status, replayed), (StatusCode::OK, true), "{told}");
+        assert_eq!(files(&told).len(), 4, "nothing joined again");
+    }
+    let back = add(&server, &id, &[5]).await;
+    assert_eq!(files(&back).len(), 5);
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn photos_that_cannot_join_are_refused_and_change_nothing() {
     let server = TestServer::with(|config, _| config.limits.network_photos_max = 4).await;
@@ -225,9 +271,7 @@ async fn photos_that_cannot_join_are_refused_and_change_nothing() {
     assert_eq!(status, StatusCode::NOT_FOUND);
     let kept = server.service.get(&id).await.unwrap();
     assert_eq!((kept.version, kept.growth.state), (1, GrowthState::None));
-    let objects = std::fs::read_dir(server.data_dir().join(format!("scenes/{id}"))).unwrap();
-    let names = objects.map(|object| object.unwrap().file_name().into_string().unwrap());
-    assert!(!names.into_iter().any(|name| name.starts_with("added")), "nothing is kept of them");
+    assert_eq!(added(&server, &id), [""; 0], "nothing is kept of them");
 }
 
 #[tokio::test(flavor = "multi_thread")]

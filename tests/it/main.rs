@@ -43,6 +43,7 @@ mod proto;
 mod raw;
 mod received;
 mod refine;
+mod scale;
 mod schedule;
 mod slow_callers;
 mod splat_scenes;

@@ -155,7 +155,34 @@ def test_a_true_length_makes_metres_which_a_link_carries(
     for one in [page, other]:
         one.locator("#view").click(position={"x": 250, "y": 330})
         expect(one.locator("#picked")).to_contain_text(re.compile(r"\d m from the camera"))
+    expect(other.locator("#scale-says")).to_have_text(re.compile("by the length that was given"))
     context.close()
+    # It is kept with the scene, and nothing said takes it back.
+    say = ("(scale) => fetch(`/v1/scenes/${segsplat.state.scene.id}/scale`, scale)"
+           ".then((answer) => answer.json())")
+    assert page.evaluate(say, {})["source"] == "given"
+    assert page.evaluate(say, {"method": "PUT", "body": "{}"})["source"] == "none"
+
+
+def test_points_say_a_way_an_area_and_heights_over_the_ground(
+        page: Page, url: str, scene: str) -> None:
+    page.goto(f"{url}/#scene={scene}")
+    settled(page)
+    until(page, "segsplat.state.scale?.ground")
+    page.click("#measure")
+    for n, (x, y) in enumerate([(250, 330), (420, 330), (350, 420)], 1):
+        page.locator("#view").click(position={"x": x, "y": y})
+        until(page, f"segsplat.state.marks.length === {n}")
+    said = page.locator("#picked")
+    expect(said).to_have_text(re.compile(r"along the points, [\d.]+² between them\."))
+    expect(said).to_contain_text(re.compile(r"The last one is -?[\d.e-]+ over the ground\."))
+    expect(page.locator("#picked input")).to_have_count(0)
+    before = page.locator("#over").evaluate("(canvas) => canvas.toDataURL()")
+    page.click("#ground")
+    settled(page)
+    assert page.locator("#over").evaluate("(canvas) => canvas.toDataURL()") != before
+    page.click("#ground")
+    page.click("#measure")
 
 
 def test_a_video_goes_through_the_views_that_were_kept(page: Page, url: str, splats: str) -> None:

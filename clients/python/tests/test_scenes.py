@@ -290,3 +290,24 @@ def test_a_file_of_gaussians_is_a_scene(client: Client, scene: Scene, tmp_path: 
         made.delete()
     with pytest.raises(FileNotFoundError):
         client.scene(tmp_path / "none.ply")
+
+
+def test_a_scene_is_in_metres_once_a_length_is_said(scene: Scene) -> None:
+    assert (before := scene.scale()).source == "none" and before.metres_per_unit is None
+    assert np.linalg.norm(before.up) == pytest.approx(1)
+    points = [(0, 0, 0), (3, 0, 4), (3, 5, 4)]
+    try:
+        assert scene.measure(points).unit == "unknown"
+        known = scene.set_scale(2.5, points=points[:2])
+        assert (known.source, known.metres_per_unit) == ("given", 0.5)
+        found = scene.measure(points)
+        assert (found.unit, found.length, found.legs) == ("metre", 5.0, (2.5, 2.5))
+        assert found.area == pytest.approx(3.125) and len(found.heights) in (0, 3)
+        size = scene.query("box").boxes[0].size
+        by_thing = scene.set_scale(1.0, thing={"text": "box", "side": "longest"})
+        assert by_thing.metres_per_unit == pytest.approx(1 / max(size))
+        assert scene.set_scale(metres_per_unit=0.25).metres_per_unit == 0.25
+        with pytest.raises(InvalidRequest, match="points or with thing"):
+            scene.set_scale(1.0)
+    finally:
+        assert scene.set_scale().source == "none"

@@ -138,7 +138,8 @@ limits! {
     features_bytes_max: u64 = 1 << 30;
     /// Bytes kept of the parts of scenes that were looked for to give boxes.
     pieces_cache_bytes_max: u64 = 128 << 20, restart;
-    /// Parts of one text's selection that an answer lists, the largest first.
+    /// Parts of one text's selection that an answer lists, the largest first; points of one call
+    /// that are measured.
     parts_max: usize = 64;
     /// Bytes of photos that the create call read, kept in memory for the jobs of their scenes. A
     /// job whose photos do not fit reads them again.

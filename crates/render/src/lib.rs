@@ -100,6 +100,27 @@ pub enum Samples {
     LevelsRgba,
 }
 
+/// Where a view draws what a photo gave the scene.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(u32)]
+pub enum Layer {
+    /// By depth.
+    #[default]
+    Front,
+    /// Behind all that is in front, by depth.
+    Behind,
+    /// Nowhere. Merged Gaussians ([`merged`]) go by the photo that theirs name first.
+    LeftOut,
+}
+
+impl Layer {
+    /// Behind, or in front.
+    #[must_use]
+    pub const fn behind_if(behind: bool) -> Self {
+        if behind { Self::Behind } else { Self::Front }
+    }
+}
+
 /// A photo of the scene as a view needs it: where its Gaussians were seen from.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Source {
@@ -109,8 +130,8 @@ pub struct Source {
     pub axis: [f32; 3],
     /// 1 / focal length in pixels of the network's picture; 0 where nothing is known.
     pub scale: f32,
-    /// Whether its Gaussians are drawn behind all of the others.
-    pub behind: bool,
+    /// Where its Gaussians are drawn.
+    pub layer: Layer,
 }
 
 impl Source {

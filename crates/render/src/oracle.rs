@@ -11,7 +11,7 @@ use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::{
-    Background, Labels, RenderRequest, Source,
+    Background, Labels, Layer, RenderRequest, Source,
     constants::{
         ALPHA_MAX, ALPHA_MIN, BLUR_PX2, FRUSTUM_MARGIN, OWN_SIZE, PIXEL_PX2, SH_C0, SH_C1, SH_C2,
         SH_C3, SH_OFFSET, TRANSMITTANCE_MIN,
@@ -292,6 +292,9 @@ fn splat_of(
     let [qw, qx, qy, qz] = gaussians.quats()[i].map(f64::from);
     let r = DMat3::from_quat(DQuat::from_xyzw(qx, qy, qz, qw).normalize());
     let source = request.sources.get(usize::from(gaussians.source()[i].view));
+    if source.is_some_and(|source| source.layer == Layer::LeftOut) {
+        return None;
+    }
     let lost = source.map_or(0.0, |source| blur_lost(source, mean, t.z, lens));
     let scales = gaussians.scales()[i].map(|s| f64::from(s).powi(2) + lost).map(f64::sqrt);
     let s = DMat3::from_diagonal(DVec3::from(scales));
@@ -335,7 +338,7 @@ fn splat_of(
         conic,
         half_height: (reach * (yy + blur)).sqrt(),
         opacity,
-        behind: source.is_some_and(|source| source.behind),
+        behind: source.is_some_and(|source| source.layer == Layer::Behind),
         depth: t.z,
         color: color(&gaussians.sh()[i * k..(i + 1) * k], from_eye.normalize_or_zero()),
         entry: gaussians.semantic_index()[i],

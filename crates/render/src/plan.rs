@@ -3,7 +3,7 @@
 //! **Layers.** A network composes few photos at a time. The union of many photos holds every
 //! surface many times, each time at a slightly different depth, and the nearest one wins. So a view
 //! is made from the few photos taken closest to it. The rest is drawn behind them, where they saw
-//! nothing: [`Source::behind`].
+//! nothing: [`Layer::Behind`].
 //!
 //! **Magnification.** The network learnt its Gaussians together with the renderer's blur
 //! ([`crate::scene::BLUR_PX2`]) at the size of its own pictures. A view that shows them larger (a
@@ -31,7 +31,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use crate::{
-    Background, RenderRequest, Source,
+    Background, Layer, RenderRequest, Source,
     constants::OWN_SIZE,
     error::Result,
     scene::{BLUR_PX2, Camera, Gaussians, Method, Scene, SceneCamera},
@@ -91,7 +91,7 @@ pub fn sources(scene: &Scene, camera: &Camera, method: ViewMethod) -> Arc<[Sourc
             center: (pose.center() - origin).as_vec3().to_array(),
             axis: pose.axis().as_vec3().to_array(),
             scale: if method.magnify && *focal > 0.0 { focal.recip() as f32 } else { 0.0 },
-            behind,
+            layer: Layer::behind_if(behind),
         }
     };
     photos.map(row).collect()

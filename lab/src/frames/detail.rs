@@ -10,7 +10,7 @@ use super::{Args, frontier::times, generated::scene};
 use crate::{
     error::{Error, Result},
     render::{
-        Frame, Kinds, RenderRequest, Source,
+        Frame, Kinds, Layer, RenderRequest, Source,
         compare::{differences, psnr},
     },
     rows::Rows,
@@ -49,7 +49,7 @@ fn views(args: &DetailArgs) -> Result<(Gaussians, [(&'static str, RenderRequest)
         center: [0.0; 3],
         axis: [0.0, 0.0, 1.0],
         scale: (1.0 / scenes::camera(side, side).intrinsics.fx) as f32,
-        behind: false,
+        layer: Layer::Front,
     };
     let served = RenderRequest { sources: Arc::new([photo]), ..plain.clone() };
     Ok((gaussians, [("file", plain), ("photos", served)]))

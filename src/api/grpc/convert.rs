@@ -6,18 +6,19 @@ use super::pb;
 use crate::{
     error::{Error, Result, short},
     scene::{
-        CameraToWorld, CameraUse, CamerasMode, CamerasReport, CamerasSource, DropCount,
-        GrowthState, HealthReport, Intrinsics, LeftOutPhoto, MovedCamera, PlacedPhoto, Refine,
-        RefineReport, RefineState, ScoringMethod, SemanticsReport, StageTime, Warning,
+        CameraToWorld, CameraUse, CamerasMode, CamerasReport, CamerasSource, DropCount, Ground,
+        GrowthState, HealthReport, Intrinsics, LeftOutPhoto, LengthUnit, MovedCamera, PlacedPhoto,
+        Refine, RefineReport, RefineState, ScoringMethod, SemanticsReport, StageTime, Warning,
     },
     service::{
-        BackgroundSpec, Boxes, CallerLimits, CameraSpec, Density, ERROR_FAST, Event, ExportFormat,
-        FeatureKind, FeaturesSpec, Format, InstanceBox, KnownWord, Label, LensSpec, MaskFormat,
-        MaskLevel, MaxError, Method, ModelInfo, ModelsInfo, Peak, PickSpec, Picked, PictureKind,
-        PictureOptions, PoseSpec, Preset, QueryAnswer, QuerySpec, RenderedView, SceneCamera,
-        SceneEdits, SceneError, SceneOptions, SceneState, SceneStatus, ScoringOptions,
-        SemanticsMode, SemanticsState, SemanticsStatus, TextOptions, TextResult, TextView,
-        TextWarning, Trust, ViewOptions,
+        BackgroundSpec, BoxSide, Boxes, CallerLimits, CameraSpec, Density, ERROR_FAST, Event,
+        ExportFormat, FeatureKind, FeaturesSpec, Format, InstanceBox, KnownWord, Label, LensSpec,
+        MaskFormat, MaskLevel, MaxError, Measured, Method, ModelInfo, ModelsInfo, Peak, PickSpec,
+        Picked, PictureKind, PictureOptions, PoseSpec, Preset, QueryAnswer, QuerySpec,
+        RenderedView, ScaleSource, ScaleSpec, ScaleThing, SceneCamera, SceneEdits, SceneError,
+        SceneOptions, SceneScale, SceneState, SceneStatus, ScoringOptions, SemanticsMode,
+        SemanticsState, SemanticsStatus, TextOptions, TextResult, TextView, TextWarning, Trust,
+        ViewOptions,
     },
 };
 
@@ -26,6 +27,54 @@ macro_rules! message {
     ($message:ident from $from:ident { $($same:ident),+ } $($other:tt)*) => {
         pb::$message { $($same: $from.$same,)+ $($other)* }
     };
+}
+
+/// What a call says of how large a scene is.
+pub(super) fn scale_spec(request: pb::SetScaleRequest) -> Result<ScaleSpec> {
+    let pb::SetScaleRequest { metres, points, thing, metres_per_unit, .. } = request;
+    let points = match &*places(&points)? {
+        [] => None,
+        [a, b] => Some([*a, *b]),
+        more => {
+            let what = format!("points has {} points; a length is between 2", more.len());
+            return Err(Error::invalid(what));
+        }
+    };
+    let thing = thing.map(|pb::ScaleThing { text, part, side }| {
+        let side = value("thing.side", side)?;
+        Ok::<_, Error>(ScaleThing { text, part, side })
+    });
+    Ok(ScaleSpec { metres, points, thing: thing.transpose()?, metres_per_unit })
+}
+
+/// Points of the world, three numbers each.
+pub(super) fn places(numbers: &[f64]) -> Result<Vec<[f64; 3]>> {
+    let (points, rest) = numbers.as_chunks();
+    match rest {
+        [] => Ok(points.to_vec()),
+        _ => Err(Error::invalid(format!("points has {} numbers, not 3 each", numbers.len()))),
+    }
+}
+
+/// What is known of how large a scene is.
+pub(super) fn scale(found: SceneScale) -> pb::SceneScale {
+    let ground = |Ground { normal, point, share }: Ground| pb::Ground {
+        normal: normal.into(),
+        point: point.into(),
+        share,
+    };
+    message!(SceneScale from found { metres_per_unit }
+        source: pb::ScaleSource::from(found.source).into(),
+        up: found.up.into(),
+        ground: found.ground.map(ground),
+    )
+}
+
+/// Lengths between points.
+pub(super) fn measured(found: Measured) -> pb::Measured {
+    message!(Measured from found { length, legs, area, heights }
+        unit: pb::LengthUnit::from(found.unit).into(),
+    )
 }
 
 /// Edits and what they come to.
@@ -128,6 +177,7 @@ fn cameras_report(report: CamerasReport) -> pb::CamerasReport {
     let left_out = |LeftOutPhoto { file, reason }| pb::LeftOutPhoto { file, reason };
     message!(CamerasReport from report { confidence }
         source: pb::CamerasSource::from(report.source).into(),
+        unit: pb::LengthUnit::from(report.unit).into(),
         placed: report.placed.into_iter().map(placed).collect(),
         left_out: report.left_out.into_iter().map(left_out).collect(),
     )
@@ -537,6 +587,8 @@ to_number! {
     RefineState = RefineState { None, Running, Done, Failed }
     SemanticsState = SemanticsState { Off, None, Running, Ready, Failed }
     CamerasSource = CamerasSource { Given, Solved }
+    LengthUnit = LengthUnit { Unknown, Metre }
+    ScaleSource = ScaleSource { None, Capture, Given }
     Trust = Trust { Good, Fair, Poor, Unmeasured }
 }
 
@@ -550,6 +602,7 @@ both_ways! {
     Preset = Preset { Default, Paper }
     MaskLevel = MaskLevel { Widest, Whole, Part, Subpart }
     FeatureKind = FeatureKind { Weights, Features }
+    BoxSide = BoxSide { Height, Width, Depth, Longest }
     Boxes = Boxes { Oriented, Upright, Aligned, None }
     MaskFormat = MaskFormat { Rle, Png, None }
 }

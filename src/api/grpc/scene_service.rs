@@ -129,6 +129,31 @@ impl pb::scene_service_server::SceneService for Api {
         .await
     }
 
+    async fn get_scale(&self, request: Request<pb::GetScaleRequest>) -> Answer<pb::SceneScale> {
+        answer(self, request, |api, request| async move {
+            Ok(convert::scale(api.service.scale(&request.scene_id.parse()?).await?))
+        })
+        .await
+    }
+
+    async fn set_scale(&self, request: Request<pb::SetScaleRequest>) -> Answer<pb::SceneScale> {
+        answer(self, request, |api, request| async move {
+            let id = request.scene_id.parse()?;
+            let wait = request.semantics_wait_ms.map(Duration::from_millis);
+            let spec = convert::scale_spec(request)?;
+            Ok(convert::scale(api.service.set_scale(&id, spec, wait).await?))
+        })
+        .await
+    }
+
+    async fn measure(&self, request: Request<pb::MeasureRequest>) -> Answer<pb::Measured> {
+        answer(self, request, |api, request| async move {
+            let points = convert::places(&request.points)?;
+            Ok(convert::measured(api.service.measure(&request.scene_id.parse()?, points).await?))
+        })
+        .await
+    }
+
     async fn get_edits(&self, request: Request<pb::GetEditsRequest>) -> Answer<pb::SceneEdits> {
         answer(self, request, |api, request| async move {
             convert::edits(api.service.edits(&request.scene_id.parse()?).await?)

@@ -19,6 +19,7 @@ mod multipart;
 mod openapi;
 mod photos;
 mod render;
+mod scale;
 mod scenes;
 mod serve;
 mod texts;
@@ -80,6 +81,9 @@ pub fn routes() -> Vec<Route> {
         ("DELETE", "/v1/scenes/{id}/photos/{name}", "remove_photo", write, delete(photos::remove)),
         ("GET", "/v1/scenes/{id}/edits", "get_edits", read, get(edits::get)),
         ("PUT", "/v1/scenes/{id}/edits", "set_edits", write, put(edits::set)),
+        ("GET", "/v1/scenes/{id}/scale", "get_scale", read, get(scale::get)),
+        ("PUT", "/v1/scenes/{id}/scale", "set_scale", write, put(scale::set)),
+        ("POST", "/v1/scenes/{id}/measure", "measure", read, post(scale::measure)),
         ("GET", "/v1/scenes/{id}/view", "render_view", read, get(render::view)),
         ("POST", "/v1/scenes/{id}/views", "render_views", read, post(views::views)),
         ("POST", "/v1/scenes/{id}/query", "query", read, post(texts::query)),

@@ -17,7 +17,7 @@ use utoipa::{
 use super::{
     edits,
     error::{ErrorBody, PROBLEM, ProblemBody},
-    health, inference, photos, render, scenes, texts, viewer, views,
+    health, inference, photos, render, scale, scenes, texts, viewer, views,
 };
 use crate::{
     api::Api,
@@ -30,7 +30,8 @@ use crate::{
 };
 
 /// Schemas of what callers send, whose fields have bounds. Those of answers have none.
-const SENT: [&str; 4] = ["CameraFields", "EditsBody", "QueryBody", "ViewsRequest"];
+const SENT: [&str; 6] =
+    ["CameraFields", "EditsBody", "MeasureBody", "QueryBody", "ScaleBody", "ViewsRequest"];
 
 /// This document
 #[utoipa::path(
@@ -50,6 +51,7 @@ pub(super) async fn document(State(api): State<Api>) -> Json<Value> {
     paths(
         scenes::create, scenes::list, scenes::get, scenes::delete, scenes::events, scenes::refine,
         photos::add, photos::remove, edits::get, edits::set,
+        scale::get, scale::set, scale::measure,
         render::view, views::views, texts::query, texts::pick, render::export, render::features,
         health::models, health::live, health::ready, health::metrics, document, viewer::index,
         viewer::sample, inference::server_metadata, inference::server_live,

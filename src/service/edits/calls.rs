@@ -100,7 +100,8 @@ impl Shared {
             let found = resolve::resolve(&self.backend, Some(&find), &limits, base, &list.specs)?;
             (found.gaussians, found.counts)
         } else {
-            let found = edited(&list.resolved, &base.gaussians, limits.gaussians_max)?;
+            let found =
+                edited(&list.resolved, &base.gaussians, &base.meta.cameras, limits.gaussians_max)?;
             (found.gaussians, found.counts)
         };
         let scene = Arc::new(base.after_edits(gaussians, list.sha256.clone()));

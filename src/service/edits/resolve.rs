@@ -9,7 +9,7 @@ use super::spec::{Asked, EditSpec};
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
-    scene::{Edit, Editing, Gaussians, Place, Scene, Selected},
+    scene::{Edit, Editing, FLOATERS_PHOTOS_MIN, Gaussians, Place, Scene, Selected},
     semantics::{Components, Instance, InstanceOptions},
     service::{
         pick,
@@ -55,11 +55,21 @@ pub(super) fn resolve(
     base: &Arc<Scene>,
     specs: &[EditSpec],
 ) -> Result<ResolvedEdits> {
-    let mut editing = Editing::new(&base.gaussians, limits.gaussians_max);
+    let mut editing = Editing::new(&base.gaussians, &base.meta.cameras, limits.gaussians_max);
     let (mut edits, mut counts) = (Vec::new(), Vec::new());
     for (i, spec) in specs.iter().enumerate() {
         let at = format!("edits[{i}]");
         let of = match spec.asked(&at, limits)? {
+            Asked::Floaters => {
+                let photos = base.meta.cameras.len();
+                if photos < FLOATERS_PHOTOS_MIN {
+                    let needs =
+                        format!("floaters are known of {FLOATERS_PHOTOS_MIN} photos and more");
+                    let has = format!("{at}.select: the scene has {photos} photos");
+                    return Err(Error::invalid(format!("{has}; {needs}")));
+                }
+                Selected { floaters: true, ..Selected::default() }
+            }
             Asked::Place(place) => Selected { within: vec![place], ..Selected::default() },
             Asked::Text { text, parts, scoring } => {
                 let how = ScoringChoice { preset: None, changes: scoring };
@@ -96,7 +106,7 @@ fn named(error: &Error, at: &str) -> Error {
 fn of_text(
     scored: &SceneTexts,
     base: &Scene,
-    editing: &Editing,
+    editing: &Editing<'_>,
     parts: Option<&[u32]>,
     limits: &Limits,
     at: &str,

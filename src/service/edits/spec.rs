@@ -81,8 +81,8 @@ pub struct EditPick {
     pub height: Option<u32>,
 }
 
-/// Which Gaussians an edit takes: one of `text`, `box`, `sphere`, `point` and `pick`. It looks at
-/// the scene as the edits before it leave it.
+/// Which Gaussians an edit takes: one of `text`, `box`, `sphere`, `point`, `pick` and `floaters`. It
+/// looks at the scene as the edits before it leave it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct EditSelection {
@@ -108,6 +108,9 @@ pub struct EditSelection {
     /// What is seen at a pixel.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pick: Option<EditPick>,
+    /// What no photo confirms and two or more see through, of the scene as it was made.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub floaters: bool,
 }
 
 /// One edit of a scene.
@@ -161,6 +164,7 @@ pub(super) enum Asked {
     Place(Place),
     Point(DVec3),
     Pick(Box<PickSpec>),
+    Floaters,
 }
 
 impl EditSpec {
@@ -226,7 +230,7 @@ impl EditSpec {
 
     /// What it takes; `at` names it.
     pub(super) fn asked(&self, at: &str, limits: &Limits) -> Result<Asked> {
-        let EditSelection { text, parts, cut, r#box, sphere, point, pick } = &self.select;
+        let EditSelection { text, parts, cut, r#box, sphere, point, pick, floaters } = &self.select;
         let at = &format!("{at}.select");
         let given = [
             ("text", text.is_some()),
@@ -234,11 +238,12 @@ impl EditSpec {
             ("sphere", sphere.is_some()),
             ("point", point.is_some()),
             ("pick", pick.is_some()),
+            ("floaters", *floaters),
         ];
         let named: Vec<_> = given.iter().filter(|(_, is)| *is).map(|(name, _)| *name).collect();
         if named.len() != 1 {
             let has = if named.is_empty() { "none".to_owned() } else { named.join(" and ") };
-            let must = "it must have one of text, box, sphere, point and pick";
+            let must = "it must have one of text, box, sphere, point, pick and floaters";
             return Err(Error::invalid(format!("{at} has {has}; {must}")));
         }
         for (name, is) in [("parts", parts.is_some()), ("cut", cut.is_some())] {
@@ -272,6 +277,9 @@ impl EditSpec {
         if let Some(point) = *point {
             lengths(&format!("{at}.point"), &point)?;
             return Ok(Asked::Point(DVec3::from(point)));
+        }
+        if *floaters {
+            return Ok(Asked::Floaters);
         }
         let pick = pick.as_ref().ok_or_else(|| Error::internal("a selection without a kind"))?;
         let named = |e: Error| Error::invalid(format!("{at}.pick.camera: {}", e.message()));

@@ -39,10 +39,12 @@ from .types import (
     ExportCall,
     Kind,
     Matches,
+    Measured,
     Models,
     Photo,
     Picked,
     QueryCall,
+    Scale,
     SceneOptions,
     SceneStatus,
     ViewCall,
@@ -440,7 +442,7 @@ def add(
 
 def remove(scene: Handle, photo: str | Photo, progress: Progress = None) -> Flow[None]:
     """Takes a photo out of a finished scene and waits until the scene is without it. Its file stays
-    on the server until the scene is deleted.
+    on the server as long as a photo that came with it is in the scene.
 
     photo: one of `scene.photos`, or its file name.
     progress: as `wait` takes it.
@@ -459,6 +461,47 @@ def _changed(scene: Handle, request: Request, progress: Progress) -> Flow[None]:
     if fault:
         kind = SegSplatError.of_code.get(fault.code, SegSplatError)
         raise kind(fault.message, code=fault.code, scene=scene.id)
+
+
+# Size
+
+
+def scale(scene: Handle) -> Flow[Scale]:
+    """What is known of how large the scene is: metres, up and the ground."""
+    answer = yield from send(scene.policy, Request("GET", f"/v1/scenes/{scene.id}/scale"))
+    return parse(Scale, _json(answer.body))
+
+
+def set_scale(
+    scene: Handle,
+    metres: float | None = None,
+    *,
+    points: Iterable[Sequence[float]] | None = None,
+    thing: str | Mapping[str, Any] | None = None,
+    metres_per_unit: float | None = None,
+) -> Flow[Scale]:
+    """Says how large the scene is; without anything it is again what the capture says.
+
+    metres: a length, of what `points` or `thing` says.
+    points: the two points of the world that it is between.
+    thing: what it is a side of: a text, or `{"text": "door", "part": 0, "side": "height"}`; a side
+        is height, width, depth or longest.
+    metres_per_unit: in place of all of these.
+    """
+    named = {"text": thing} if isinstance(thing, str) else thing
+    ends = None if points is None else [[float(v) for v in point] for point in points]
+    said = dict(metres=metres, points=ends, thing=named, metres_per_unit=metres_per_unit)
+    body = {name: value for name, value in said.items() if value is not None}
+    answer = yield from send(scene.policy, Request("PUT", f"/v1/scenes/{scene.id}/scale", json=body))
+    return parse(Scale, _json(answer.body))
+
+
+def measure(scene: Handle, points: Iterable[Sequence[float]]) -> Flow[Measured]:
+    """Lengths, area and heights over the ground of points of the world, joined in their order: in
+    metres where `scale` knows them."""
+    path, body = f"/v1/scenes/{scene.id}/measure", {"points": [[float(v) for v in p] for p in points]}
+    answer = yield from send(scene.policy, Request("POST", path, json=body))
+    return parse(Measured, _json(answer.body))
 
 
 # Edits

@@ -46,7 +46,7 @@ SCENES = "segsplat.v1.SceneService"
 METHODS = {
     **{"events": "WatchScene", "view": "RenderView", "views": "RenderViews", "query": "Query"},
     **{"pick": "Pick", "export": "Export", "models": "Models"},
-    **{"refine": "RefineScene", "features": "Features"},
+    **{"refine": "RefineScene", "features": "Features", "measure": "Measure"},
     **{"POST": "CreateScene", "GET": "GetScene", "DELETE": "DeleteScene"},
 }
 SCORING = ("canon", "tau", "cut", "unit_rows", "coverage_floor", "near_best", "margin", "rivals")
@@ -76,7 +76,8 @@ def messages(step: Request) -> tuple[MethodDescriptor, Message | Iterator[Messag
     if photos := re.fullmatch(r"/v1/scenes/(\w+)/photos(?:/(.+))?", step.path):
         return _photos(step, *photos.groups())
     *_, scenes, id, action = ["", "", *step.path.removeprefix("/v1/").split("/")][-3:]
-    edits = {"GET": "GetEdits", "PUT": "SetEdits"}.get(step.method) if action == "edits" else None
+    kept = {"edits": "Edits", "scale": "Scale"}.get(action)
+    edits = {"GET": "Get", "PUT": "Set"}[step.method] + kept if kept else None
     if scenes != "scenes":
         id, action = action if id == "scenes" else "", "" if id == "scenes" else action
     name = "ListScenes" if action == "scenes" and step.method == "GET" else METHODS.get(action)
@@ -158,6 +159,12 @@ def _nested(method: str, fields: dict[str, Any]) -> dict[str, Any]:
         rest["semantics_wait_ms"] = rest.pop("wait_ms")
     if scoring := {name: rest.pop(name) for name in SCORING if name in rest}:
         taken["scoring"] = scoring
+    if method in ("SetScale", "Measure"):
+        rest["points"] = [v for point in rest.get("points") or () for v in point]
+    if "thing" in rest:
+        thing = dict(rest.pop("thing"))
+        side = {"side": _enum("box_side", thing.pop("side"))} if "side" in thing else {}
+        taken["thing"] = {**thing, **side}
     if "edits" in rest:
         rest["edits_json"] = json.dumps(rest.pop("edits")).encode()
     if method == "Export":

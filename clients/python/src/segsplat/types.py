@@ -355,6 +355,48 @@ class RefineReport:
     more_photos: int = 0
 
 
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """A plane that things stand on."""
+
+    #: Up, a unit vector.
+    normal: Floats
+    #: A point of it, in the middle of what was seen of it; world units.
+    point: Floats
+    #: Share of the scene's Gaussians that lie on it, 0 to 1.
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """What is known of how large a scene is and how it stands."""
+
+    #: Where the metres come from: none, capture, given.
+    source: str
+    #: Up, a unit vector of the world.
+    up: Floats
+    #: Metres of a unit of the world, where they are known.
+    metres_per_unit: float | None = None
+    #: The ground, where one was found.
+    ground: Ground | None = None
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Lengths between points of a scene."""
+
+    #: Unit of the lengths: metre; unknown: that of the world. Areas are in its square.
+    unit: str
+    #: From the first point to the last, by way of all others.
+    length: float
+    #: From each point to the next one.
+    legs: tuple[float, ...] = ()
+    #: Area of the polygon of the points; of three and more.
+    area: float | None = None
+    #: Of each point over the ground; empty where none was found.
+    heights: tuple[float, ...] = ()
+
+
 @dataclass(frozen=True)
 class PlacedPhoto:
     """A photo whose camera the server found."""
@@ -391,6 +433,8 @@ class CamerasReport:
     placed: tuple[PlacedPhoto, ...] = ()
     #: Photos that are no part of the scene.
     left_out: tuple[LeftOutPhoto, ...] = ()
+    #: What a unit of the world is, as far as the capture says: metre, unknown.
+    unit: str = "unknown"
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,17 @@ pub enum CamerasSource {
     Solved,
 }
 
+/// What a unit of the cameras is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum LengthUnit {
+    /// Nobody said.
+    #[default]
+    Unknown,
+    /// A metre: the program that wrote the cameras measures in metres.
+    Metre,
+}
+
 /// What refinement does with the cameras of the photos.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
@@ -38,7 +49,7 @@ pub enum CameraUse {
     Given,
 }
 
-display_names!(CamerasMode, CamerasSource, CameraUse);
+display_names!(CamerasMode, CamerasSource, CameraUse, LengthUnit);
 
 /// A photo whose camera was solved.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -69,6 +80,9 @@ pub struct CamerasReport {
     /// Where they come from.
     #[schema(required = true)]
     pub source: CamerasSource,
+    /// What a unit of the world is, as far as the capture says.
+    #[schema(required = true)]
+    pub unit: LengthUnit,
     /// How likely solved cameras are right, 0..1; none of given ones.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub confidence: Option<f64>,

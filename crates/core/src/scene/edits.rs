@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     error::{Error, Result},
-    scene::{Gaussians, RawGaussians, SH_C0, ShRotation},
+    scene::{Gaussians, RawGaussians, SH_C0, SceneCamera, ShRotation, floaters},
 };
 
 /// A part of space, world frame.
@@ -61,6 +61,9 @@ pub struct Selected {
     pub numbers: Option<Vec<[u32; 2]>>,
     /// Places of their centres, one of which is enough; empty: everywhere.
     pub within: Vec<Place>,
+    /// Whether those alone that no photo confirms, before all edits: [`floaters`].
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub floaters: bool,
 }
 
 impl Selected {
@@ -134,21 +137,29 @@ pub struct Edited {
     pub counts: Vec<u64>,
 }
 
-/// The Gaussians after all edits, which may be at most `most`. Gaussians that no edit took keep
+/// The Gaussians of a scene with these cameras after all edits, which may be at most `most`. Gaussians that no edit took keep
 /// their numbers, bit for bit, and their order; copies come last.
 ///
 /// # Errors
 /// `limit_exceeded` where copies make too many.
-pub fn edited(edits: &[Edit], gaussians: &Gaussians, most: usize) -> Result<Edited> {
-    let mut editing = Editing::new(gaussians, most);
+pub fn edited(
+    edits: &[Edit],
+    gaussians: &Gaussians,
+    cameras: &[SceneCamera],
+    most: usize,
+) -> Result<Edited> {
+    let mut editing = Editing::new(gaussians, cameras, most);
     let counts = edits.iter().map(|edit| editing.apply(edit)).collect::<Result<_>>()?;
     Ok(Edited { gaussians: editing.gaussians()?, counts })
 }
 
 /// Gaussians that are being edited.
 #[derive(Clone, Debug)]
-pub struct Editing {
+pub struct Editing<'c> {
     whole: Gaussians,
+    cameras: &'c [SceneCamera],
+    /// Which of the whole float, once an edit asked for them.
+    floaters: Option<Vec<bool>>,
     raw: RawGaussians,
     /// `[N]` number that each, or what it is a copy of, had before all edits.
     numbers: Vec<u32>,
@@ -159,14 +170,16 @@ pub struct Editing {
     most: usize,
 }
 
-impl Editing {
-    /// Begins with these Gaussians; `most` bounds how many copies make of them.
+impl<'c> Editing<'c> {
+    /// Begins with the Gaussians of a scene with these cameras; `most` bounds how many copies make
+    /// of them.
     #[must_use]
-    pub fn new(gaussians: &Gaussians, most: usize) -> Self {
+    pub fn new(gaussians: &Gaussians, cameras: &'c [SceneCamera], most: usize) -> Self {
         let raw = gaussians.clone().into_raw();
         let there = vec![true; raw.means.len()];
         let numbers = (0..).take(raw.means.len()).collect();
-        Self { whole: gaussians.clone(), raw, numbers, there, changed: false, most }
+        let (whole, floaters) = (gaussians.clone(), None);
+        Self { whole, cameras, floaters, raw, numbers, there, changed: false, most }
     }
 
     /// Applies an edit; gives how many Gaussians it took.
@@ -236,11 +249,18 @@ impl Editing {
         there.map(|(number, _)| *number).collect()
     }
 
-    fn taken(&self, of: &Selected) -> Vec<bool> {
+    fn taken(&mut self, of: &Selected) -> Vec<bool> {
+        if of.floaters && self.floaters.is_none() {
+            self.floaters = Some(floaters(&self.whole, self.cameras));
+        }
         let (raw, there) = (&self.raw, &self.there);
+        let floaters = self.floaters.as_deref().filter(|_| of.floaters);
         let takes = |(i, mean): (usize, &[f32; 3])| {
             let point = world(raw.origin, *mean);
-            there[i] && of.takes(point, raw.semantic_index[i], self.numbers[i])
+            let number = self.numbers[i];
+            there[i]
+                && floaters.is_none_or(|floats| floats[number as usize])
+                && of.takes(point, raw.semantic_index[i], number)
         };
         raw.means.par_iter().enumerate().with_min_len(1 << 12).map(takes).collect()
     }
@@ -327,7 +347,7 @@ mod tests {
     }
 
     fn one(action: EditAction, of: Selected, gaussians: &Gaussians) -> Edited {
-        edited(&[Edit { action, of }], gaussians, 1000).unwrap()
+        edited(&[Edit { action, of }], gaussians, &[], 1000).unwrap()
     }
 
     #[test]
@@ -407,14 +427,14 @@ mod tests {
         let placement = Placement { translation: [0.0, 7.0, 0.0], ..Placement::default() };
         let copy = Edit { action: EditAction::Copy(placement), of: of_entry(2) };
         let delete = Edit { action: EditAction::Delete, of: of_entry(2) };
-        let copied = edited(std::slice::from_ref(&copy), &whole, 7).unwrap();
+        let copied = edited(std::slice::from_ref(&copy), &whole, &[], 7).unwrap();
         assert_eq!((copied.gaussians.len(), &*copied.counts), (7, &[2][..]));
         assert_eq!(copied.gaussians.semantic_index()[5..], [2, 2]);
         assert_eq!(copied.gaussians.means()[..5], *whole.means(), "the first ones stay");
         assert_eq!(copied.gaussians.means()[5], [1.0, 7.25, -0.5]);
-        let both = edited(&[copy.clone(), delete], &whole, 7).unwrap();
+        let both = edited(&[copy.clone(), delete], &whole, &[], 7).unwrap();
         assert_eq!((both.gaussians.len(), &*both.counts), (3, &[2, 4][..]), "the copy goes too");
-        let refused = edited(&[copy], &whole, 6).unwrap_err();
+        let refused = edited(&[copy], &whole, &[], 6).unwrap_err();
         assert!(refused.message().contains('7') && refused.message().contains('6'), "{refused}");
     }
 
@@ -430,7 +450,7 @@ mod tests {
             one(EditAction::Copy(placement), numbers(&[[1, 2], [8, 1]])),
             one(EditAction::Delete, numbers(&[[4, 2], [8, 3]])),
         ];
-        let edited = edited(&edits, &whole, 20).unwrap();
+        let edited = edited(&edits, &whole, &[], 20).unwrap();
         assert_eq!(edited.counts, [3, 2, 3], "1 is gone; 4, 8 and the copy of 8");
         let left: Vec<f32> = edited.gaussians.means().iter().map(|mean| mean[0]).collect();
         assert_eq!(left, [2.0, 3.0, 6.0, 7.0, 2.0]);

@@ -10,8 +10,10 @@ mod capture;
 mod edits;
 mod failure;
 mod finished;
+mod floaters;
 mod gaussians;
 mod geometry;
+mod ground;
 mod growth;
 mod id;
 mod method;
@@ -29,14 +31,17 @@ pub use axes::{covariance, principal_axes};
 pub use backdrop::Backdrop;
 pub use camera::{Camera, CameraToWorld, Intrinsics, ORTHONORMAL_TOLERANCE, Region};
 pub use cameras::{
-    CameraUse, CamerasMode, CamerasReport, CamerasSource, LeftOutPhoto, PlacedPhoto, SolvedCamera,
+    CameraUse, CamerasMode, CamerasReport, CamerasSource, LeftOutPhoto, LengthUnit, PlacedPhoto,
+    SolvedCamera,
 };
 pub use capture::{Capture, ViewSet};
 pub use edits::{Edit, EditAction, Edited, Editing, Place, Placement, Selected, edited};
 pub use failure::SceneError;
 pub use finished::{PhotoHash, Provenance, Scene, SceneMeta};
+pub use floaters::{FLOATERS_PHOTOS_MIN, floaters};
 pub use gaussians::{BLUR_PX2, Gaussians, RawGaussians, SH_C0, SanitizeReport, SourcePixel};
 pub use geometry::ViewGaussians;
+pub use ground::{Ground, ground};
 pub use growth::{GrowthState, GrowthStatus};
 pub use id::{SCENE_ID_CHARS, SceneId};
 pub use method::{

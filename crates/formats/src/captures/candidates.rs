@@ -21,7 +21,7 @@ use super::{
 };
 use crate::{
     error::{Error, Result},
-    scene::{Warning, WarningCode},
+    scene::{LengthUnit, Warning, WarningCode},
 };
 
 /// Cameras of a folder that are read.
@@ -92,6 +92,11 @@ impl Candidate {
     /// Whether a folder `masks` beside its photos holds their masks.
     pub(super) fn has_mask_folder(&self) -> bool {
         self.seen.layout.has_mask_folder()
+    }
+
+    /// What a unit of its poses is.
+    pub(super) fn unit(&self) -> LengthUnit {
+        self.seen.layout.unit()
     }
 
     /// How good it is beside one with `most` photos.

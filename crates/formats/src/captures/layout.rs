@@ -11,7 +11,10 @@ pub(crate) use super::{
         rotation, text,
     },
 };
-use crate::error::{Error, Result};
+use crate::{
+    error::{Error, Result},
+    scene::LengthUnit,
+};
 
 /// A layout of captures: how it is recognised by its files, and how its cameras are read.
 pub(crate) trait Layout: Sync {
@@ -21,6 +24,11 @@ pub(crate) trait Layout: Sync {
     /// Whether a folder `masks` beside the photos holds their masks.
     fn has_mask_folder(&self) -> bool {
         false
+    }
+
+    /// What a unit of its poses is.
+    fn unit(&self) -> LengthUnit {
+        LengthUnit::Unknown
     }
 
     /// Where each capture of this layout begins: a camera file, or the folder of several.

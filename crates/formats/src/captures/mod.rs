@@ -49,7 +49,7 @@ use crate::{
     error::{Error, Result},
     limits::Limits,
     scene::{
-        CameraToWorld, SentBytes, SentFile, Upload, UploadCameras, UploadFile, Warning,
+        CameraToWorld, LengthUnit, SentBytes, SentFile, Upload, UploadCameras, UploadFile, Warning,
         WarningCode, photo_label as label,
     },
 };
@@ -156,6 +156,8 @@ pub struct FoundPhotos<'a> {
     pub more: Vec<FoundPhoto<'a>>,
     /// What was not used or not there.
     pub warnings: Vec<Warning>,
+    /// What a unit of the poses is.
+    pub unit: LengthUnit,
 }
 
 impl<'a> FoundPhotos<'a> {
@@ -176,7 +178,7 @@ impl<'a> FoundPhotos<'a> {
         );
         let names = more.iter().map(|photo| &*photo.name);
         warnings.extend(told(WarningCode::PhotosForSteps, more.len(), &why, names));
-        Self { photos, more, warnings }
+        Self { photos, more, warnings, unit: LengthUnit::Unknown }
     }
 }
 
@@ -262,6 +264,7 @@ fn of_folder<'a>(
     let tests = test_list(folder)?;
     let mut files = folder.take_cameras_read();
     let Best { candidate, warning } = candidates::best(folder, &tests)?;
+    let unit = candidate.unit();
     let masks = Masks::of(folder.paths(), candidate.has_mask_folder() || folder.is_form());
     files.extend(candidate.files);
     let Candidate { entries, held_out, unread, place, sent, pairs, missing, .. } = candidate;
@@ -332,7 +335,7 @@ fn of_folder<'a>(
         Ok(FoundPhoto { mask, ..found(&entries[entry], name, path, pose, bytes) })
     };
     let all = chosen.into_iter().zip(of_each).map(take).collect::<Result<_>>()?;
-    Ok((FoundPhotos::of(all, warnings, limits), files))
+    Ok((FoundPhotos { unit, ..FoundPhotos::of(all, warnings, limits) }, files))
 }
 
 /// The message where no camera has its photo.

@@ -18,7 +18,7 @@ use super::{
     tiles::{Grid, TileSpans},
 };
 use crate::{
-    Source,
+    Layer, Source,
     constants::{BEHIND_BIT, TILE_SIZE},
     scene::Gaussians,
 };
@@ -81,7 +81,7 @@ pub struct DepthKeys<'a> {
 impl<'a> DepthKeys<'a> {
     /// Keys of Gaussians that come from these photos.
     pub fn new(gaussians: &'a Gaussians, sources: &'a [Source]) -> Self {
-        let layered = sources.iter().any(|source| source.behind);
+        let layered = sources.iter().any(|source| source.layer == Layer::Behind);
         Self { gaussians, sources: if layered { sources } else { &[] } }
     }
 
@@ -91,7 +91,7 @@ impl<'a> DepthKeys<'a> {
         if !self.sources.is_empty() {
             let (gaussians, own) = shown.find(self.gaussians, id);
             let view = usize::from(gaussians.source()[own].view);
-            if self.sources.get(view).is_some_and(|source| source.behind) {
+            if self.sources.get(view).is_some_and(|source| source.layer == Layer::Behind) {
                 key |= BEHIND_BIT;
             }
         }

@@ -15,7 +15,7 @@ use super::{
     tiles::{BLOCK, Ellipses, Grid, TileSpans},
 };
 use crate::{
-    RenderRequest, Source,
+    Layer, RenderRequest, Source,
     constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK, OWN_SIZE, PIXEL_PX2},
     scene::Gaussians,
     view::View,
@@ -218,6 +218,10 @@ impl Block {
                     depth += from * f64::from(source.axis[axis]);
                 }
                 self.width[k] = depth.max(0.0) * f64::from(source.scale);
+                if source.layer == Layer::LeftOut {
+                    // It reaches no bound, whatever is made of it.
+                    self.opacity[k] = f64::NAN;
+                }
             }
         }
     }

@@ -88,13 +88,13 @@ pub struct SourceRow {
     pub center: [f32; 3],
     pub scale: f32,
     pub axis: [f32; 3],
-    pub behind: u32,
+    pub layer: u32,
 }
 
 impl From<&Source> for SourceRow {
     fn from(source: &Source) -> Self {
-        let Source { center, axis, scale, behind } = *source;
-        Self { center, scale, axis, behind: u32::from(behind) }
+        let Source { center, axis, scale, layer } = *source;
+        Self { center, scale, axis, layer: layer as u32 }
     }
 }
 

@@ -6,7 +6,7 @@ use parking_lot::Mutex;
 
 use super::device::Gpu;
 use crate::{
-    Kinds, Labels, RenderRequest, Samples,
+    Kinds, Labels, Layer, RenderRequest, Samples,
     constants::shared,
     error::{Error, Result},
     scene::Backdrop,
@@ -32,6 +32,10 @@ shared! { pub(super) u32;
     LEVELS_RGB = 1;
     /// Colour and alpha in four bytes.
     LEVELS_RGBA = 2;
+    /// What a photo gave is behind all that is in front.
+    BEHIND = Layer::Behind as u32;
+    /// What a photo gave is not drawn.
+    LEFT_OUT = Layer::LeftOut as u32;
     /// Sums that a tile gives for each of its pairs in the backward pass.
     PAIR_SUMS = 10;
     /// Derivatives of a Gaussian but for its harmonics, and whether it is seen.

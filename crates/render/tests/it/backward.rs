@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use segsplat_core::scene::{Backdrop, CameraToWorld, Gaussians, RawGaussians, SourcePixel};
 use segsplat_render::{
-    Background, DifferentiableRenderer, Kinds, RenderRequest, Source,
+    Background, DifferentiableRenderer, Kinds, Layer, RenderRequest, Source,
     backward::{FrameGradients, Gradients},
     cpu::CpuRenderer,
     oracle,
@@ -182,13 +182,13 @@ fn check_differences(name: &str, raw: &RawGaussians, request: &RenderRequest) {
 
 /// Photos of a pixel of `scale` at depth 1, one of them behind: large pixels magnify.
 fn sources(scale: f32) -> Arc<[Source]> {
-    let source = |x: f32, behind: bool| Source {
+    let source = |x: f32, layer: Layer| Source {
         center: [x, 0.1, -4.0],
         axis: [0.0, 0.0, 1.0],
         scale,
-        behind,
+        layer,
     };
-    [source(0.0, false), source(0.3, true)].into()
+    [source(0.0, Layer::Front), source(0.3, Layer::Behind)].into()
 }
 
 fn sky() -> Background {

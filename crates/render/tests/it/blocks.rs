@@ -7,7 +7,7 @@ use glam::DVec3;
 use proptest::prelude::*;
 use segsplat_core::scene::{Camera, Gaussians, Intrinsics, RawGaussians, Region, SourcePixel};
 use segsplat_render::{
-    Frame, Labels, RenderRequest, Renderer, Source, Switches,
+    Frame, Labels, Layer, RenderRequest, Renderer, Source, Switches,
     blocks::{BLOCK, Blocks, Frustum},
     cpu::{
         CpuRenderer,
@@ -63,7 +63,7 @@ pub(crate) fn any_request(random: &mut Random) -> RenderRequest {
         center: [k as f32 - 1.0, 0.3, -2.0],
         axis: [0.0, 0.0, 1.0],
         scale: [0.0, 0.002, 0.03][k as usize],
-        behind: k == 1,
+        layer: Layer::behind_if(k == 1),
     };
     let photos = random.bits().is_multiple_of(2);
     RenderRequest {

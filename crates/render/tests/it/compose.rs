@@ -9,7 +9,7 @@ use segsplat_core::scene::{
     SceneMeta, SourcePixel,
 };
 use segsplat_render::{
-    Background, Frame, Kinds, Labels, RenderRequest, Renderer, Samples,
+    Background, Frame, Kinds, Labels, Layer, RenderRequest, Renderer, Samples,
     oracle::{self, OraclePixel},
     plan::{ViewMethod, served, sources},
 };
@@ -69,8 +69,8 @@ pub(crate) fn scene(photos: u16, opacity: [f32; 2], coarse: f64) -> Scene {
 /// Photos in front of and behind a view.
 fn layers(scene: &Scene, x: f64) -> [Vec<usize>; 2] {
     let rows = sources(scene, &at(x), ViewMethod::from(&scene.meta.report.method));
-    let of = |behind| (0..rows.len()).filter(|&i| rows[i].behind == behind).collect();
-    [of(false), of(true)]
+    let of = |layer| (0..rows.len()).filter(|&i| rows[i].layer == layer).collect();
+    [of(Layer::Front), of(Layer::Behind)]
 }
 
 #[test]
@@ -141,10 +141,36 @@ fn views_of_many_photos_are_those_of_the_oracle() {
                 rows.iter_mut().for_each(change);
                 r.sources = rows.into();
             };
-            let layers = without(&|r| flat(r, &|row| row.behind = false));
+            let layers = without(&|r| flat(r, &|row| row.layer = Layer::Front));
             assert_eq!(layers, photos > 4, "{name}: layers");
             let scaled = without(&|r| flat(r, &|row| row.scale = 0.0));
             assert_eq!(scaled, !OWN_SIZES.contains(&coarse), "{name}: size");
+        }
+    }
+}
+
+/// A view of a scene in which what these photos gave is left out.
+pub(crate) fn without(request: &RenderRequest, photos: &[usize]) -> RenderRequest {
+    let mut request = request.clone();
+    let rows = Arc::make_mut(&mut request.sources);
+    photos.iter().for_each(|&photo| rows[photo].layer = Layer::LeftOut);
+    request
+}
+
+#[test]
+fn what_a_photo_gave_can_be_left_out() {
+    // Seen smaller, magnified, and as the antialiased mode has it.
+    for (coarse, antialiased) in [(0.1, false), (3.0, false), (1.0, true)] {
+        let scene = scene(6, [0.2, 0.9], coarse);
+        let name = format!("{coarse} times, antialiased: {antialiased}");
+        let asked = RenderRequest { antialiased, ..served(&scene, request(at(1.1))) };
+        for left_out in [&[2][..], &[0, 5], &[0, 1, 2, 3, 4, 5]] {
+            let asked = without(&asked, left_out);
+            let (frame, _) = judged(&name, &scene, &asked);
+            let source = scene.gaussians.source();
+            let copy = scene.gaussians.only(|i| !left_out.contains(&source[i].view.into()));
+            let of_copy = cpu().render(&copy, &asked).expect("a view");
+            assert_eq!(frame, of_copy, "{name}: no bit is another one without {left_out:?}");
         }
     }
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use segsplat_core::scene::{Backdrop, Gaussians, RawGaussians};
 use segsplat_render::{
-    Background, Frame, Kinds, Labels, RenderRequest, Renderer, Samples, Source,
+    Background, Frame, Kinds, Labels, Layer, RenderRequest, Renderer, Samples, Source,
     budget::{ERROR_MAX, brightest},
     compare::differences,
     cpu::shade,
@@ -54,8 +54,11 @@ fn bright(gaussians: &Gaussians) -> Gaussians {
 fn layered((gaussians, request): (Gaussians, RenderRequest)) -> (Gaussians, RenderRequest) {
     let mut raw = gaussians.into_raw();
     raw.source.iter_mut().step_by(2).for_each(|source| source.view = 1);
-    let source = |behind| Source { center: [0.0; 3], axis: [0.0, 0.0, 1.0], scale: 0.01, behind };
-    (checked(raw), RenderRequest { sources: [source(false), source(true)].into(), ..request })
+    let source = |layer| Source { center: [0.0; 3], axis: [0.0, 0.0, 1.0], scale: 0.01, layer };
+    (
+        checked(raw),
+        RenderRequest { sources: [source(Layer::Front), source(Layer::Behind)].into(), ..request },
+    )
 }
 
 fn walls() -> Gaussians {

@@ -7,7 +7,7 @@ use segsplat_core::{
     scene::{Gaussians, RawGaussians},
 };
 use segsplat_render::{
-    Background, Frame, Labels, RenderRequest, Renderer, Source, cpu::CpuRenderer,
+    Background, Frame, Labels, Layer, RenderRequest, Renderer, Source, cpu::CpuRenderer,
 };
 
 use crate::common::gpu;
@@ -179,7 +179,7 @@ fn a_request_that_cannot_be_drawn_is_refused_by_name() {
         (
             with(&|r| {
                 let (center, axis) = ([0.0, f32::NAN, 0.0], [0.0, 0.0, 1.0]);
-                r.sources = [Source { center, axis, scale: 0.0, behind: false }].into();
+                r.sources = [Source { center, axis, scale: 0.0, layer: Layer::Front }].into();
             }),
             "source 0",
         ),

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use glam::{DMat3, DVec3};
 use segsplat_core::scene::{Camera, Gaussians, SourcePixel, covariance};
 use segsplat_render::{
-    Frame, Kinds, Labels, RenderRequest, Renderer, Source, Switches,
+    Frame, Kinds, Labels, Layer, RenderRequest, Renderer, Source, Switches,
     blocks::{BLOCK, BLOCKS_MIN, Blocks, Frustum},
     compare::psnr,
     cpu::{CpuRenderer, cull::Shown},
@@ -256,7 +256,7 @@ fn afar(side: u32, pixels: u32, times: f64, photo: bool) -> (Gaussians, RenderRe
     let eye = DVec3::new(0.07, -0.03, -4.0 * (times - 1.0));
     let view = Camera { camera_to_world: look(eye, eye + DVec3::Z), ..camera(pixels, pixels) };
     let scale = camera(side, side).intrinsics.fx.recip() as f32;
-    let source = Source { center: [0.0; 3], axis: [0.0, 0.0, 1.0], scale, behind: false };
+    let source = Source { center: [0.0; 3], axis: [0.0, 0.0, 1.0], scale, layer: Layer::Front };
     let sources: Arc<[Source]> = if photo { [source].into() } else { Arc::default() };
     (gaussians, RenderRequest { sources, ..request(view) })
 }
@@ -285,7 +285,7 @@ fn cases() -> Vec<(String, Gaussians, RenderRequest)> {
         center: [0.2 * k as f32, 0.0, -1.0],
         axis: [0.0, 0.0, 1.0],
         scale: 0.004 * k as f32,
-        behind: k == 1,
+        layer: Layer::behind_if(k == 1),
     };
     let layered = RenderRequest { sources: (0..3).map(source).collect(), ..within.clone() };
     let antialiased = RenderRequest { antialiased: true, ..within.clone() };

@@ -6,14 +6,14 @@ use std::sync::Arc;
 
 use segsplat_core::scene::{Backdrop, Region, Scene};
 use segsplat_render::{
-    Background, Frame, Kinds, Labels, RenderRequest, Renderer, Samples, gpu::GpuRenderer, oracle,
-    plan::served,
+    Background, Frame, Kinds, Labels, Layer, RenderRequest, Renderer, Samples, gpu::GpuRenderer,
+    oracle, plan::served,
 };
 use segsplat_testing::{frames::rounded, labels::table, scenes::request};
 
 use crate::{
     common::{both_kernels, cpu, judge, open},
-    compose::{at, scene},
+    compose::{at, scene, without},
     pool::at_once,
 };
 
@@ -58,8 +58,10 @@ fn views_of_many_photos_are_those_of_the_cpu() {
                 let other = RenderRequest { sources: rows.into(), ..asked.clone() };
                 draw(gpu, &scene, &other).color != frame.color
             };
-            assert_eq!(with(&|row| row.behind = false), photos > 4, "{name}: layers");
+            assert_eq!(with(&|row| row.layer = Layer::Front), photos > 4, "{name}: layers");
             assert!(with(&|row| row.scale = 0.0), "{name}: size");
+            let asked = without(&asked, &[0, usize::from(photos) - 1]);
+            judge(gpu, &format!("{name}, two left out"), &scene.gaussians, &asked);
         }
     }
 }

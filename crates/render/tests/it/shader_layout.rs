@@ -157,7 +157,7 @@ fn structs_lie_in_memory_as_the_shaders_say() {
             "Footprint",
             [mean, conic_shear, conic_x, conic_y, power_max, opacity, depth]
         ),
-        layout!(SourceRow, "Source", [center, scale, axis, behind]),
+        layout!(SourceRow, "Source", [center, scale, axis, layer]),
         layout!(PlanRow, "Plan", [isects, needed, visible, farthest, rows]),
         layout!(
             TrainingRow,

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use segsplat_core::scene::{Camera, Gaussians, RawGaussians};
 use segsplat_render::{
-    Kinds, RenderRequest, Renderer, Source,
+    Kinds, Layer, RenderRequest, Renderer, Source,
     constants::OWN_SIZE,
     cpu::{
         footprint::Footprint,
@@ -35,8 +35,12 @@ fn view(
     let half = raw.means.len() / 2;
     raw.source.iter_mut().skip(half).for_each(|source| source.view = 1);
     let scale = if known { middle.intrinsics.fx.recip() as f32 } else { 0.0 };
-    let source =
-        |x: f32| Source { center: [x, 0.0, 0.0], axis: [0.0, 0.0, 1.0], scale, behind: false };
+    let source = |x: f32| Source {
+        center: [x, 0.0, 0.0],
+        axis: [0.0, 0.0, 1.0],
+        scale,
+        layer: Layer::Front,
+    };
     let mut camera = middle;
     camera.intrinsics = middle.intrinsics.resized(side, side);
     let sources: Arc<[Source]> = [source(-0.4), source(0.4)].into();
@@ -55,7 +59,7 @@ fn what_neighbours_need_changes_no_bit() {
         center: [0.0; 3],
         axis: [0.0, 0.0, 1.0],
         scale: (0.2 * 40.0_f64.powf(f64::from(i) / f64::from(count)) / middle.intrinsics.fx) as f32,
-        behind: false,
+        layer: Layer::Front,
     };
     let request = RenderRequest { sources: (0..count).map(source).collect(), ..request(middle) };
     let footprints = |order: &[usize]| {
@@ -185,7 +189,7 @@ fn what_a_small_gaussian_adds_is_kept() {
         center: [0.0; 3],
         axis: [0.0, 0.0, 1.0],
         scale: own.intrinsics.fx.recip() as f32,
-        behind: false,
+        layer: Layer::Front,
     };
     let sum = |renderer: &dyn Renderer, side: u32| -> f64 {
         let mut camera = own;

@@ -2,7 +2,7 @@
 
 use segsplat_core::scene::{Gaussians, RawGaussians};
 use segsplat_render::{
-    Source,
+    Layer, Source,
     constants::TILE_SIZE,
     cpu::{
         bin::{DepthKeys, bin, pack},
@@ -37,7 +37,10 @@ fn each_tile_gets_the_gaussians_that_touch_it_those_of_photos_behind_last() {
         });
     }
     let total: usize = want.iter().map(Vec::len).sum();
-    let source = |behind| Source { center: [0.0; 3], axis: [0.0; 3], scale: 0.0, behind };
+    let source = |behind| {
+        let layer = Layer::behind_if(behind);
+        Source { center: [0.0; 3], axis: [0.0; 3], scale: 0.0, layer }
+    };
     for behind in [false, true] {
         let sources = [source(behind)];
         let mut bins = Vec::new();

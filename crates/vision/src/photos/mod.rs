@@ -35,8 +35,8 @@ use crate::{
     limits::Limits,
     photo_label as label,
     scene::{
-        Camera, CamerasMode, CamerasReport, Photo, PosedPhoto, SceneCamera, SolvedCamera, Warning,
-        WarningCode, unless_cancelled,
+        Camera, CamerasMode, CamerasReport, LengthUnit, Photo, PosedPhoto, SceneCamera,
+        SolvedCamera, Warning, WarningCode, unless_cancelled,
     },
 };
 
@@ -50,6 +50,8 @@ pub struct ReadPhotos {
     pub photos: Vec<PosedPhoto>,
     /// What of the upload was not used or not there.
     pub warnings: Vec<Warning>,
+    /// What a unit of the cameras is.
+    pub unit: LengthUnit,
 }
 
 /// Reads an upload into photos with cameras, in the order of the cameras.
@@ -479,7 +481,7 @@ fn decoded(found: &FoundPhotos<'_>, limits: &Limits, cancel: &AtomicBool) -> Res
     let mut warnings = [found.warnings.clone(), all.warnings.clone()].concat();
     warnings.extend(masked(&all.photos, &taken));
     warnings.extend(bent_away(&all.photos, &taken));
-    Ok(ReadPhotos { photos, warnings })
+    Ok(ReadPhotos { photos, warnings, unit: found.unit })
 }
 
 /// Says how much masks leave out.

@@ -330,7 +330,13 @@ fn confirmed(
     };
     let doubts = solution.warnings.iter().filter(is_new).map(doubt).collect();
     let confidence = Some(confidence);
-    let cameras = CamerasReport { source: CamerasSource::Solved, confidence, placed, left_out };
+    let cameras = CamerasReport {
+        source: CamerasSource::Solved,
+        confidence,
+        placed,
+        left_out,
+        ..CamerasReport::default()
+    };
     Ok(Confirmed { photos: posed, cameras, doubts })
 }
 

@@ -20,7 +20,7 @@ use crate::{
     capture, center_of,
     error::{Error, Result},
     lift::{Fusion, UnionOptions},
-    refine::judged_as_served,
+    refine::judged_without,
     scene::{
         Camera, Gaussians, HealthReport, PosedPhoto, Scene, SceneCamera, SceneMeta, SceneOptions,
         Stage, Watch,
@@ -231,10 +231,8 @@ fn is_as_good(
     let made = Scene::new(meta, made.gaussians.clone(), made.backdrop.clone());
     let mut gain = 0.0;
     for photo in judges(photos, kept.len(), made.meta.report.median_depth) {
-        let truth = [at_side(&photos[photo], JUDGED_SIDE)];
-        let of = |scene: &Scene, number: usize| {
-            judged_as_served(renderer, &without(scene, number), &truth)
-        };
+        let truth = at_side(&photos[photo], JUDGED_SIDE);
+        let of = |scene: &Scene, number| judged_without(renderer, scene, number, &truth);
         if let (Some(old), Some(new)) = (of(served, kept[photo])?, of(&made, photo)?) {
             gain += new.psnr - old.psnr + LOST_DB;
         }
@@ -254,17 +252,6 @@ fn judges(photos: &[PosedPhoto], before: usize, depth: f64) -> Vec<usize> {
         old.iter().enumerate().map(|(i, photo)| (to_new(photo), i)).collect();
     near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     near.into_iter().take(JUDGES).map(|(_, photo)| photo).collect()
-}
-
-/// A scene as it is served without what one of its photos gave it.
-fn without(scene: &Scene, photo: usize) -> Scene {
-    let source = scene.gaussians.source();
-    let gaussians = scene.gaussians.only(|i| usize::from(source[i].view) != photo);
-    let mut meta = scene.meta.clone();
-    if let Some(focal) = meta.report.network_focal_px.get_mut(photo) {
-        *focal = 0.0;
-    }
-    Scene { meta, gaussians, semantics: None, ..scene.clone() }
 }
 
 /// The Gaussians of the photos `kept`, whose numbers are their places there.

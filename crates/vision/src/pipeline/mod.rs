@@ -217,8 +217,10 @@ pub fn read_dir(
 }
 
 fn given(read: ReadPhotos, begun: Instant) -> ReadSet {
-    let ReadPhotos { photos, warnings } = read;
-    ReadSet::Posed(PhotoSet::given(photos, warnings, took_to_read(begun)))
+    let ReadPhotos { photos, warnings, unit } = read;
+    let mut set = PhotoSet::given(photos, warnings, took_to_read(begun));
+    set.cameras.unit = unit;
+    ReadSet::Posed(set)
 }
 
 fn unposed(read: ReadUnposed, begun: Instant) -> ReadSet {

@@ -29,7 +29,7 @@ use std::{
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 use segsplat_render::{
-    Background, DifferentiableRenderer, Frame, Kinds, RenderRequest, Renderer,
+    Background, DifferentiableRenderer, Frame, Kinds, Layer, RenderRequest, Renderer,
     compare::psnr,
     plan::{default_near, served, widened},
     train::{
@@ -644,9 +644,37 @@ pub fn judged_as_served(
     held_out: &[PosedPhoto],
 ) -> Result<Option<Judged>> {
     let held_out: Vec<HeldOutPhoto> = held_out.par_iter().map(HeldOutPhoto::new).collect();
+    judged(&held_out, |camera| renderer.render(&scene.gaussians, &served_at(scene, camera)))
+}
+
+/// How near a scene is to a photo of its own when what this one gave it is left out.
+///
+/// # Errors
+/// Those of the renderer.
+pub(crate) fn judged_without(
+    renderer: &dyn Renderer,
+    scene: &Scene,
+    number: usize,
+    photo: &PosedPhoto,
+) -> Result<Option<Judged>> {
+    // The Gaussians are shared: a renderer that has them has nothing to prepare.
+    let mut scene = scene.clone();
+    if let Some(focal) = scene.meta.report.network_focal_px.get_mut(number) {
+        *focal = 0.0;
+    }
+    judged(&[HeldOutPhoto::new(photo)], |camera| {
+        let mut view = served_at(&scene, camera);
+        if let Some(source) = Arc::make_mut(&mut view.sources).get_mut(number) {
+            source.layer = Layer::LeftOut;
+        }
+        renderer.render(&scene.gaussians, &view)
+    })
+}
+
+/// A view of colour of a scene as it is served.
+fn served_at(scene: &Scene, camera: Camera) -> RenderRequest {
     let near = default_near(scene.meta.report.median_depth);
-    let view = |camera| served(scene, RenderRequest::plain(camera, Kinds::COLOR, near));
-    judged(&held_out, |camera| renderer.render(&scene.gaussians, &view(camera)))
+    served(scene, RenderRequest::plain(camera, Kinds::COLOR, near))
 }
 
 /// How near what `draw` gives is to photos, colours as 8 bits hold them; `None` of no photo.

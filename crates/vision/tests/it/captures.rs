@@ -10,7 +10,7 @@ use std::{
 use segsplat_core::{
     error::{Error, ErrorCode},
     limits::Limits,
-    scene::{CamerasMode, PosedPhoto, Upload, UploadFile, Warning, WarningCode},
+    scene::{CamerasMode, LengthUnit, PosedPhoto, Upload, UploadFile, Warning, WarningCode},
 };
 use segsplat_testing::captures::{self, LAYOUTS, zipped};
 use segsplat_vision::{
@@ -80,6 +80,9 @@ fn apart(a: &PosedPhoto, b: &PosedPhoto) -> f64 {
     numbers(a).iter().zip(numbers(b)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
 }
 
+/// Layouts of programs that measure in metres.
+const METRES: [&str; 5] = ["polycam", "polycam_corrected", "record3d", "r3d", "arkitscenes"];
+
 #[test]
 fn every_layout_gives_the_same_photos_however_it_is_sent() {
     let (posed, _) = sent();
@@ -96,8 +99,10 @@ fn every_layout_gives_the_same_photos_however_it_is_sent() {
             // What a folder's provenance names is a capture of its own.
             ("found", read(found.photos).unwrap()),
         ];
-        for (way, ReadPhotos { photos, warnings }) in ways {
+        for (way, ReadPhotos { photos, warnings, unit }) in ways {
             assert_eq!(warnings, [], "{layout} {way}");
+            let metres = METRES.contains(&layout);
+            assert_eq!(unit == LengthUnit::Metre, metres, "{layout} {way}");
             assert_eq!(photos.len(), 3, "{layout} {way}");
             for (got, want) in photos.iter().zip(&reference) {
                 assert_eq!(got.photo.rgb, want.photo.rgb, "{layout} {way} {}", got.file);

@@ -79,7 +79,7 @@ fn judge(way: &str, right: &Value, read: Result<ReadPhotos>) {
         let has = |word: &Value| error.message().contains(word.as_str().unwrap());
         return assert!(words.iter().all(has), "{way}: {error}");
     }
-    let ReadPhotos { photos, mut warnings } = read.unwrap_or_else(|e| panic!("{way}: {e}"));
+    let ReadPhotos { photos, mut warnings, .. } = read.unwrap_or_else(|e| panic!("{way}: {e}"));
     assert_eq!(photos.len() as u64, right["photos"], "{way}");
     let fx = photos[0].camera.intrinsics.fx;
     assert!((fx - right["fx"].as_f64().unwrap()).abs() < 0.01, "{way}: fx {fx}");

@@ -14,6 +14,7 @@ use crate::{
         numbers_of, pinhole, text,
     },
     error::Result,
+    scene::LengthUnit,
 };
 
 pub(super) struct ArKitScenes;
@@ -53,6 +54,10 @@ fn timed<'a>(folder: &'a Folder<'_>, dir: &str, wanted: fn(&str) -> bool) -> Vec
 impl Layout for ArKitScenes {
     fn name(&self) -> &'static str {
         "ARKitScenes"
+    }
+
+    fn unit(&self) -> LengthUnit {
+        LengthUnit::Metre
     }
 
     fn find(&self, folder: &Folder<'_>) -> Vec<String> {

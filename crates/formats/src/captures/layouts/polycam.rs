@@ -13,6 +13,7 @@ use crate::{
         CameraEntry, Described, Folder, Layout, PoseAxes, names, number, object, pinhole,
     },
     error::{Error, Result},
+    scene::LengthUnit,
 };
 
 pub(super) struct Polycam;
@@ -31,6 +32,10 @@ fn jsons<'a>(folder: &'a Folder<'_>, dir: &'a str) -> impl Iterator<Item = &'a s
 impl Layout for Polycam {
     fn name(&self) -> &'static str {
         "Polycam"
+    }
+
+    fn unit(&self) -> LengthUnit {
+        LengthUnit::Metre
     }
 
     fn find(&self, folder: &Folder<'_>) -> Vec<String> {

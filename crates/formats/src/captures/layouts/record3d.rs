@@ -15,6 +15,7 @@ use crate::{
         rotation,
     },
     error::{Error, Result},
+    scene::LengthUnit,
 };
 
 pub(super) struct Record3d;
@@ -39,6 +40,10 @@ fn list<const N: usize>(value: Option<&Value>) -> Option<[f64; N]> {
 impl Layout for Record3d {
     fn name(&self) -> &'static str {
         "Record3D"
+    }
+
+    fn unit(&self) -> LengthUnit {
+        LengthUnit::Metre
     }
 
     fn find(&self, folder: &Folder<'_>) -> Vec<String> {
