@@ -446,7 +446,8 @@ impl SemanticNetworks for PipelineNetworks {
     ) -> Result<Vec<Vec<u16>>> {
         let (cameras, gaussians) = (&scene.meta.cameras[..], &scene.gaussians);
         let input = SemanticsInput { photos, cameras, gaussians };
-        words::find_words(self.0.get()?, &input, texts, cancel)
+        let depth = scene.meta.report.median_depth;
+        words::find_words(self.0.get()?, &input, depth, texts, cancel)
     }
 
     fn without_words(

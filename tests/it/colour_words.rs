@@ -234,9 +234,9 @@ async fn a_word_is_found_in_the_photos_by_a_network_that_masks_texts() {
     let answer = body(sent).await.unwrap();
     assert_eq!(answer["scoring"]["canon"], towers["scoring"]["canon"], "{answer}");
     let found = [0, 1].map(|i| answer["results"][i]["gaussians"].as_u64().unwrap());
-    // At the edge of the square they say otherwise than the network.
+    // At the edge of the square they may say otherwise than the network.
     let edge = words[0] - found[0];
-    assert!(edge > 0 && 20 * edge < words[0] && found[1] < edge + 1, "{answer}");
+    assert!(20 * edge < words[0] && found[1] <= edge, "{edge} of {words:?}: {answer}");
 }
 
 #[test]

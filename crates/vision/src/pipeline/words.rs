@@ -3,6 +3,13 @@
 
 use std::sync::{Arc, atomic::AtomicBool};
 
+use segsplat_render::{
+    DifferentiableRenderer, Kinds, RenderRequest,
+    backward::{FrameGradients, Gradients},
+    cpu::CpuRenderer,
+    plan::default_near,
+};
+
 use super::{
     Pipeline,
     networks::opened,
@@ -11,9 +18,14 @@ use super::{
 use crate::{
     error::Result,
     models::TextMaskNetwork,
-    scene::{IndexMap, unless_cancelled},
-    semantics::{self, Views},
+    scene::{Camera, Gaussians, IndexMap, SH_C0, SceneCamera, unless_cancelled},
+    semantics,
 };
+
+/// Sum of the weights, pixels as large as the network's, under which no photo shows a Gaussian.
+const SHOWN_MIN: f64 = 0.05;
+/// A score of 1 in maps.
+const SURE: f32 = 1_000.0;
 
 impl Pipeline {
     /// The network that masks what a text says, opened at the first call.
@@ -35,6 +47,7 @@ impl Pipeline {
 pub fn find_words(
     pipeline: &Pipeline,
     input: &SemanticsInput<'_>,
+    median_depth: f64,
     texts: &[String],
     cancel: &AtomicBool,
 ) -> Result<Vec<Vec<u16>>> {
@@ -53,10 +66,85 @@ pub fn find_words(
             of.push(network.find(&seen, text)?);
         }
     }
-    let views = Views::new(input.gaussians, input.cameras);
-    let lift = |maps: &Vec<IndexMap>| {
+    let renderer = CpuRenderer::new(pipeline.workers().current_num_threads())?;
+    lift(&renderer, input, median_depth, &maps, cancel)
+}
+
+/// `[T][N]` score of each word at each Gaussian, thousandths, from what each photo has at its
+/// cells, `[T][V]`.
+///
+/// A photo's camera sees each Gaussian with a weight at each pixel, which is what the Gaussian adds
+/// there. A word is at a Gaussian where at least half of these weights, over all photos, lie on the
+/// word; its score is their mean there. Where no photo shows a Gaussian counts what its own photo
+/// has at its pixel.
+///
+/// The sums are the derivative of a picture by the colours of its Gaussians: of a loss whose
+/// derivative by each pixel is 1, whether the word is there, and its score.
+///
+/// # Errors
+/// `cancelled`, `internal`; `limit_exceeded` where a photo shows more Gaussians than a backward
+/// pass holds at once.
+pub fn lift(
+    renderer: &dyn DifferentiableRenderer,
+    input: &SemanticsInput<'_>,
+    median_depth: f64,
+    maps: &[Vec<IndexMap>],
+    cancel: &AtomicBool,
+) -> Result<Vec<Vec<u16>>> {
+    let grey = grey(input.gaussians)?;
+    let mut gradients = Gradients::default();
+    let mut of_word = |maps: &Vec<IndexMap>| -> Result<Vec<u16>> {
+        let mut sums = vec![[0.0_f64; 3]; grey.len()];
+        for (camera, map) in input.cameras.iter().zip(maps) {
+            unless_cancelled(cancel)?;
+            let Some(camera) = small(camera) else { continue };
+            let request = RenderRequest::plain(camera, Kinds::COLOR, default_near(median_depth));
+            let by = FrameGradients { color: Some(said(&camera, map)), ..Default::default() };
+            renderer.backward(&grey, &request, &mut |_| Ok(by.clone()), &mut gradients)?;
+            for (sum, of) in sums.iter_mut().zip(&gradients.sh) {
+                sum.iter_mut().zip(of).for_each(|(sum, v)| *sum += f64::from(*v / SH_C0));
+            }
+        }
         let own = semantics::from_source(input.gaussians.source(), input.cameras, maps);
-        semantics::lifted(&views, &own, maps)
+        Ok(sums.iter().zip(own).map(|(sums, own)| score(*sums, own)).collect())
     };
-    Ok(maps.iter().map(lift).collect())
+    maps.iter().map(&mut of_word).collect()
+}
+
+/// The Gaussians in one colour, so that none is at the end of the range of colours.
+fn grey(gaussians: &Gaussians) -> Result<Gaussians> {
+    let mut raw = gaussians.clone().into_raw();
+    raw.sh = vec![[0.0; 3]; gaussians.len()];
+    Gaussians::restore(raw)
+}
+
+/// A photo's camera with pixels as large as those of the network's picture, which may lack edges.
+fn small(camera: &SceneCamera) -> Option<Camera> {
+    let lens = camera.camera.intrinsics;
+    let scale = camera.network?.fx / lens.fx;
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "pixels")]
+    let side = |of: u32| (f64::from(of) * scale).round().max(1.0) as u32;
+    let intrinsics = lens.resized(side(lens.width), side(lens.height));
+    Some(Camera { intrinsics, ..camera.camera })
+}
+
+/// Of each pixel 1, whether the photo has a word there, and the word's score, 0 to 1.
+fn said(camera: &Camera, map: &IndexMap) -> Vec<[f32; 3]> {
+    let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+    let share = |at: u32, of: u32| (f64::from(at) + 0.5) / f64::from(of);
+    let pixel = |(x, y)| {
+        let score = map.at(share(x, width), share(y, height));
+        [1.0, f32::from(u8::from(score > 0)), f32::from(score) / SURE]
+    };
+    (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(pixel).collect()
+}
+
+/// The score of a word from the weights of a Gaussian: all, on the word, and times its score.
+fn score([shown, with, sum]: [f64; 3], own: u16) -> u16 {
+    if shown < SHOWN_MIN {
+        return own;
+    }
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "thousandths")]
+    let mean = (f64::from(SURE) * sum / with).round() as u16;
+    if with > 0.0 && 2.0 * with >= shown { mean } else { 0 }
 }

@@ -32,5 +32,5 @@ pub use self::{
     score::{Scorer, Scoring, TextScores, ViewNorms},
     tracks::{Tracks, tracks},
     views::{Views, merge},
-    words::{WordBank, lifted},
+    words::WordBank,
 };

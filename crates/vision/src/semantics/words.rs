@@ -1,16 +1,14 @@
-//! Words that a network masks in the photos: lifted to Gaussians, and as a bank of their own.
+//! Words that a network masks in the photos, as a bank of their own.
 //!
 //! A bank of words has a row for each combination of words and scores that a Gaussian has. Its
 //! numbers are such that the relevancy of a word at a Gaussian is the word's score there, so all
 //! that reads banks (views, parts, exports) reads it like any other.
 
-use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::views::Views;
 use crate::{
     error::{Error, Result},
-    scene::{Bank, IndexMap, ScoringMethod},
+    scene::{Bank, ScoringMethod},
 };
 
 /// Scores that are told apart, from 1 to the score 1; they are thousandths in maps.
@@ -22,24 +20,6 @@ const RELEVANCIES: [f64; 3] = [0.51, 0.99, 0.1];
 const TAU: f64 = 500.0;
 /// What a word is compared with, in answers.
 const NOTHING: &str = "(no mask)";
-
-/// `[N]` score of a word at each Gaussian, thousandths: the mean of the photos that have it there,
-/// where they are at least half of those that show the Gaussian; else 0. `own` is what its own
-/// photo has at it, `maps` what each photo has at its cells.
-#[must_use]
-pub fn lifted(views: &Views<'_>, own: &[u16], maps: &[IndexMap]) -> Vec<u16> {
-    let score = |i: usize| {
-        let (mut shown, mut with, mut sum) = (0_u32, 0_u32, 0_u32);
-        for score in views.looks(i, own, maps).flatten() {
-            shown += 1;
-            with += u32::from(score > 0);
-            sum += u32::from(score);
-        }
-        let mean = if with > 0 && 2 * with >= shown { sum / with } else { 0 };
-        u16::try_from(mean).unwrap_or(SURE)
-    };
-    (0..own.len()).into_par_iter().map(score).collect()
-}
 
 /// Words of a scene as a bank.
 #[derive(Clone, Debug, PartialEq)]
@@ -55,7 +35,7 @@ pub struct WordBank {
 }
 
 impl WordBank {
-    /// Of the scores of each word at each Gaussian, as [`lifted`] gives them.
+    /// Of the scores of each word at each Gaussian, thousandths; 0 where it is not.
     ///
     /// # Errors
     /// `invalid_request` when more combinations occur than a bank may have rows.

@@ -1,10 +1,16 @@
 //! Photos vote for the entry of each Gaussian that they show.
 
+use std::sync::atomic::AtomicBool;
+
 use segsplat_core::scene::{
     Bank, Camera, CameraToWorld, Gaussians, IndexMap, Intrinsics, RawGaussians, SceneCamera,
     SourcePixel,
 };
-use segsplat_vision::semantics::{Views, from_source, lifted, merge};
+use segsplat_render::{Kinds, RenderRequest, cpu::CpuRenderer, oracle::contributions};
+use segsplat_vision::{
+    pipeline::{semantics::SemanticsInput, words},
+    semantics::{Views, from_source, merge},
+};
 
 const SIDE: u16 = 20;
 
@@ -94,23 +100,83 @@ fn a_photo_that_sees_something_else_there_has_no_vote() {
     assert!(voted[400..].iter().all(|m| *m == 7), "the screen keeps its own");
 }
 
+fn word(gaussians: &Gaussians, cameras: &[SceneCamera], maps: &[IndexMap]) -> Vec<u16> {
+    let input = SemanticsInput { photos: &[], cameras, gaussians };
+    let renderer = CpuRenderer::new(1).unwrap();
+    let maps = [maps.to_vec()];
+    let scores = words::lift(&renderer, &input, 10.0, &maps, &AtomicBool::new(false)).unwrap();
+    scores.into_iter().next().unwrap()
+}
+
 #[test]
-fn a_word_is_where_half_of_the_photos_that_show_it_have_it() {
+fn a_word_is_where_half_of_the_weights_of_a_gaussian_have_it() {
     let gaussians = wall(3, |_| 10.0);
     // As above; photo 1 has the word in the upper half alone, photo 2 nowhere.
     let mut maps = vec![map(12, 900), map(10, 700), map(20, 0)];
     maps[1].index[200..].fill(0);
-    let own = own(&gaussians, &maps);
-    let scores = lifted(&Views::new(&gaussians, &cameras(3)), &own, &maps);
+    let scores = word(&gaussians, &cameras(3), &maps);
     let at = |x: usize, y: usize| scores[y * 20 + x];
     assert_eq!(at(15, 5), 800, "two of three have it: their mean");
     assert_eq!(at(15, 15), 0, "one of three");
     assert_eq!(at(5, 5), 0, "none");
     // Column 1 of photo 0 is beyond the others: it alone shows it.
     let alone = vec![map(0, 600), map(20, 0), map(20, 0)];
-    let own = from_source(gaussians.source(), &cameras(3), &alone);
-    let scores = lifted(&Views::new(&gaussians, &cameras(3)), &own, &alone);
+    let scores = word(&gaussians, &cameras(3), &alone);
     assert_eq!((scores[5 * 20 + 1], scores[5 * 20 + 15]), (600, 0));
+}
+
+#[test]
+fn a_gaussian_that_no_photo_shows_has_what_its_own_photo_has_at_its_pixel() {
+    // Photo 1's Gaussians are one behind the other one's, whose wall nothing is seen through.
+    let mut raw = wall(2, |of| if of.view == 0 { 10.0 } else { 30.0 }).into_raw();
+    raw.scales[..400].fill([2.0; 3]);
+    raw.opacities[..400].fill(1.0);
+    let gaussians = Gaussians::sanitize(raw).unwrap().0;
+    let scores = word(&gaussians, &cameras(2), &[map(20, 0), map(0, 500)]);
+    assert_eq!(scores[400 + 5 * 20 + 10], 500, "hidden");
+    assert_eq!(word(&gaussians, &cameras(2), &[map(0, 500), map(20, 0)])[400 + 5 * 20 + 10], 0);
+}
+
+/// The slow twin: pixel by pixel in f64.
+#[test]
+fn weights_of_a_word_are_those_of_the_oracle() {
+    let gaussians = wall(2, |of| if (of.x / 3 + of.y / 4) % 2 == 0 { 10.0 } else { 8.0 });
+    let mut raw = gaussians.into_raw();
+    (0..raw.scales.len()).for_each(|i| raw.scales[i] = [0.1 + 0.05 * (i % 7) as f32; 3]);
+    (0..raw.opacities.len()).for_each(|i| raw.opacities[i] = 0.2 + 0.1 * (i % 8) as f32);
+    let gaussians = Gaussians::sanitize(raw).unwrap().0;
+    let cell = |i: usize, of: usize| [0, 0, 400, 600][(i / (3 + of) + i / 60) % 4];
+    let maps = [0, 1].map(|of| IndexMap {
+        width: 20,
+        height: 20,
+        index: (0..400).map(|i| cell(i, of)).collect(),
+    });
+    let mut sums = vec![[0.0_f64; 3]; gaussians.len()];
+    for (camera, map) in cameras(2).iter().zip(&maps) {
+        let intrinsics = camera.camera.intrinsics.resized(20, 20);
+        let camera = Camera { intrinsics, ..camera.camera };
+        let request = RenderRequest::plain(camera, Kinds::COLOR, 0.1);
+        for (pixel, score) in (0..400).zip(&map.index) {
+            let [x, y] = [pixel % 20, pixel / 20];
+            for of in contributions(&gaussians, &request, [x, y]).unwrap() {
+                let sum = &mut sums[of.gaussian];
+                sum[0] += of.weight;
+                sum[1] += f64::from(u8::from(*score > 0)) * of.weight;
+                sum[2] += f64::from(*score) * of.weight;
+            }
+        }
+    }
+    let scores = word(&gaussians, &cameras(2), &maps);
+    let mut told = [0; 2];
+    for (i, (score, [shown, with, sum])) in scores.iter().zip(sums).enumerate() {
+        if shown < 0.051 || (with / shown - 0.5).abs() < 1e-4 {
+            continue;
+        }
+        let wanted = if with > 0.5 * shown { sum / with } else { 0.0 };
+        assert!((f64::from(*score) - wanted).abs() < 1.0, "{i}: {score}, not {wanted}");
+        told[usize::from(*score > 0)] += 1;
+    }
+    assert!(told.iter().all(|count| *count > 50), "{told:?}");
 }
 
 fn rows(rows: &[[f32; 2]]) -> Bank {
