@@ -81,8 +81,8 @@ fn beside_largest(survey: &Survey, links: &[Link], grown: &Grown) -> Vec<usize> 
     placed.into_iter().filter(|photo| part[*photo] != largest).collect()
 }
 
-/// The strongest links that join the placed photos (a spanning tree, or several where photos are not
-/// linked), the strongest first: each with the share of its matches that the cameras explain.
+/// The strongest links that join the placed photos (a spanning tree, or several where photos are
+/// not linked), the strongest first: each with the share of its matches that the cameras explain.
 fn joints(survey: &Survey, links: &[Link], grown: &Grown) -> Vec<(f64, [usize; 2])> {
     let share = |link: &Link| {
         let (seen, _) = explained(survey, link, grown)?;
