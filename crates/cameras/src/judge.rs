@@ -6,9 +6,10 @@ use nalgebra::{Matrix3, Vector3};
 
 use crate::{
     grow::{Grower, Grown, angle_between},
+    joints::{weakest, weakest_min},
     pose::{Pose, angle_deg},
     solution::Evidence,
-    solver::{Candidate, between, explained, score_of, shares},
+    solver::{Candidate, between, explained, score_of},
     survey::{Link, Survey},
 };
 
@@ -28,15 +29,12 @@ const NEAR_PAIRS_MIN: u32 = 3;
 const TWO_PLACED: f64 = 0.4;
 const TWO_PLACED_FOCAL_KNOWN: f64 = 0.7;
 /// Where each kind of doubt halves the confidence; chosen on seven scenes (`docs/adr`, number 71).
-const WEAKEST_MIN: f64 = 0.5;
-/// Added where the links are a tree: no loop shows what is wrong.
-const WEAKEST_OF_TREE: f64 = 0.2;
 const AGREEING_MIN: f64 = 0.75;
 pub(crate) const EXPLAINED_MIN: f64 = 0.8;
 pub(crate) const RIVAL_MAX: f64 = 0.95;
 pub(crate) const MIRRORED_MAX: f64 = 0.92;
 pub(crate) const MISSING_MAX: f64 = 0.55;
-pub(crate) const LOOPS_MIN: f64 = 0.15;
+pub(crate) const LOOPS_MIN: f64 = 0.5;
 /// Photos from which on the links of a photo are counted, and how many there must be.
 pub(crate) const CHAIN_PLACED: usize = 8;
 pub(crate) const CHAIN_LINKS: f64 = 1.5;
@@ -88,19 +86,6 @@ fn rising(value: f64, middle: f64, width: f64) -> f64 {
     1.0 / (1.0 + ((middle - value) / width).exp())
 }
 
-/// Where the share of the weakest photo halves the confidence: the fewer links there are a photo,
-/// the more each must be trusted.
-pub(crate) fn weakest_min(evidence: &Evidence) -> f64 {
-    if evidence.placed < 3 {
-        return WEAKEST_MIN;
-    }
-    let placed = evidence.placed as f64;
-    let links = evidence.links as f64 / (placed - 1.0);
-    // Three photos have no more than three links.
-    let enough = (0.5 * placed).min(2.0);
-    WEAKEST_MIN + WEAKEST_OF_TREE * (enough - links).clamp(0.0, 1.0)
-}
-
 /// The confidence that the evidence gives: the product of what each kind of doubt leaves.
 pub(crate) fn confidence(evidence: &Evidence) -> f64 {
     if evidence.placed < 2 {
@@ -115,8 +100,8 @@ pub(crate) fn confidence(evidence: &Evidence) -> f64 {
     let links = evidence.links as f64 / (evidence.placed - 1) as f64;
     let held = if evidence.placed < CHAIN_PLACED { 1.0 } else { rising(links, CHAIN_LINKS, 0.1) };
     few * held
-        * rising(evidence.loops, LOOPS_MIN, 0.03)
-        * rising(evidence.weakest, weakest_min(evidence), 0.03)
+        * rising(evidence.loops, LOOPS_MIN, 0.05)
+        * rising(evidence.weakest, weakest_min(evidence.placed, evidence.links), 0.03)
         * rising(evidence.agreeing, AGREEING_MIN, 0.05)
         * rising(evidence.explained, EXPLAINED_MIN, 0.03)
         * rising(-evidence.rival, -RIVAL_MAX, 0.015)
@@ -215,12 +200,7 @@ pub(crate) fn evidence(
         error: median(&mut errors),
         loops: loops(grown, relinked),
         missing: missing(survey, best, relinked),
-        weakest: shares(survey, relinked, grown)
-            .iter()
-            .zip(&grown.poses)
-            .filter(|(_, pose)| pose.is_some())
-            .map(|(share, _)| *share)
-            .fold(1.0, f64::min),
+        weakest: weakest(survey, relinked, grown),
         placed: of_placed.len(),
         focal_known: survey
             .views

@@ -9,6 +9,7 @@ mod adjust;
 mod five_point;
 mod given;
 mod grow;
+mod joints;
 mod judge;
 mod lens;
 mod mend;

@@ -2,9 +2,9 @@
 
 use crate::{
     grow::Grown,
+    joints::weakest_min,
     judge::{
         CHAIN_LINKS, CHAIN_PLACED, EXPLAINED_MIN, LOOPS_MIN, MIRRORED_MAX, MISSING_MAX, RIVAL_MAX,
-        weakest_min,
     },
     solution::{CONFIDENCE_MIN, Evidence, Placing},
     survey::Survey,
@@ -72,11 +72,13 @@ fn doubt(evidence: &Evidence) -> &'static str {
         "two different solutions fit the photos equally well"
     } else if evidence.mirrored > MIRRORED_MAX {
         "the scene fits the photos inside out as well: take photos from nearer or wider apart"
-    } else if evidence.weakest < weakest_min(evidence) || evidence.explained < EXPLAINED_MIN {
+    } else if evidence.weakest < weakest_min(evidence.placed, evidence.links)
+        || evidence.explained < EXPLAINED_MIN
+    {
         "many matches contradict the cameras: the photos may show different sides of a thing that \
          looks alike"
     } else if evidence.loops < LOOPS_MIN {
-        "the pairs of photos contradict each other around every loop"
+        "the pairs of photos contradict each other around most loops"
     } else if evidence.placed >= CHAIN_PLACED
         && (evidence.links as f64) < CHAIN_LINKS * (evidence.placed - 1) as f64
     {

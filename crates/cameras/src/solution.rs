@@ -87,7 +87,8 @@ pub struct Evidence {
     /// Share of the pairs of near cameras that see the same points by the solution, but did not
     /// match.
     pub missing: f64,
-    /// Largest share of a pair's matches that the cameras explain, in the photo where it is least.
+    /// The placed photos are joined by pairs of which the cameras explain this share of the matches
+    /// and more.
     pub weakest: f64,
     /// Photos placed.
     pub placed: usize,

@@ -6,7 +6,7 @@ use segsplat_core::{error::Result, scene::unless_cancelled};
 
 use crate::{
     given::{PairMatches, PhotoKeypoints, SolveOptions, check},
-    judge, report,
+    joints, judge, report,
     solution::{Evidence, Placing, Solution},
     solver, world,
 };
@@ -48,7 +48,7 @@ pub fn solve(
     // As they were grown: what is finished explains more than what is not.
     let rival = judge::rival(&survey, &best, &others);
     solver::finish(&survey, &mut best, cancel);
-    let (links, dropped) = solver::drop_weak(&survey, &mut best, cancel);
+    let (links, dropped) = joints::drop_weak(&survey, &mut best, cancel);
     let evidence = judge::evidence(&survey, &best, &links, rival);
     let why_not = |photo| report::why_left_out(&survey, photo, &dropped);
     let (placings, points) = world::outcome(photos, &survey, &best, why_not)?;

@@ -36,9 +36,6 @@ const LINK_INLIERS_MIN: usize = 15;
 const FINISH_ROUNDS: usize = 4;
 const FINISH_GAIN: f64 = 1.01;
 const KEPT_SHARE: f64 = 0.95;
-/// A photo is held by a pair of which the cameras explain this share at least. Photos that only
-/// look alike agree in a third of their matches by the outline of things.
-const WEAK_SHARE: f64 = 0.42;
 
 /// A solution and what it was made from.
 pub(crate) struct Candidate {
@@ -187,53 +184,9 @@ fn joined<'a>(
     tracks::join(&counts, sightings)
 }
 
-/// Takes photos out of a solution that no pair holds: in which the cameras explain less than
-/// [`WEAK_SHARE`] of the matches with any other photo. Returns the links under the final lenses and
-/// the photos that were taken out.
-pub(crate) fn drop_weak(
-    survey: &Survey,
-    best: &mut Candidate,
-    cancel: &AtomicBool,
-) -> (Vec<Link>, Vec<usize>) {
-    let mut dropped = Vec::new();
-    loop {
-        let links = links_under(survey, best);
-        let shares = shares(survey, &links, &best.grown);
-        let weak: Vec<usize> = (0..shares.len())
-            .filter(|&i| best.grown.poses[i].is_some() && shares[i] < WEAK_SHARE)
-            .collect();
-        let placed = best.grown.poses.iter().flatten().count();
-        // Where most are weak, none is worse than the others: the confidence says it.
-        if weak.is_empty() || 2 * weak.len() > placed {
-            return (links, dropped);
-        }
-        let mut grower = Grower::new(survey, &best.tracks, &[], &best.grown.lenses, cancel);
-        grower.state = best.grown.clone();
-        for photo in &weak {
-            grower.state.poses[*photo] = None;
-        }
-        grower.settle();
-        best.grown = grower.state;
-        dropped.extend(weak);
-    }
-}
-
-/// For each photo the largest share of a pair's matches that the cameras explain.
-pub(crate) fn shares(survey: &Survey, links: &[Link], grown: &Grown) -> Vec<f64> {
-    let mut shares = vec![0.0_f64; grown.poses.len()];
-    for link in links {
-        let Some((seen, _)) = explained(survey, link, grown) else { continue };
-        let share = seen / survey.pairs[link.pair].matches.len() as f64;
-        for photo in link.photos {
-            shares[photo] = shares[photo].max(share);
-        }
-    }
-    shares
-}
-
 /// The links under the lenses that a solution found: each with the geometry that its own matches
 /// fit best, or with that of the solution, where they fit it nearly as well.
-fn links_under(survey: &Survey, best: &Candidate) -> Vec<Link> {
+pub(crate) fn links_under(survey: &Survey, best: &Candidate) -> Vec<Link> {
     let mut before: Vec<Option<Link>> = vec![None; survey.pairs.len()];
     for link in &best.links {
         before[link.pair] = Some(link.clone());
@@ -359,7 +312,7 @@ pub(crate) fn score_of(survey: &Survey, grown: &Grown) -> f64 {
 }
 
 /// The pose of the second of two placed photos from the first.
-fn between_placed(grown: &Grown, photos: [usize; 2]) -> Option<Pose> {
+pub(crate) fn between_placed(grown: &Grown, photos: [usize; 2]) -> Option<Pose> {
     let [first, second] = photos.map(|photo| grown.poses[photo].as_ref());
     Some(between(first?, second?))
 }

@@ -99,6 +99,33 @@ fn a_photo_of_another_place_is_left_out_and_named() {
 }
 
 #[test]
+fn photos_of_two_places_that_one_picture_joins_are_not_taken_for_one_place() {
+    // Six photos of one place and four of another; both have the same picture on the wall.
+    const FIRST: usize = 6;
+    for (in_picture, placed) in [(0.45, FIRST), (0.8, 10)] {
+        let plan = Plan { noise: 0.5, cameras: arc(10, 90.0, 4.0), ..plan() };
+        let (photos, mut pairs) = photos(&plan);
+        for pair in
+            pairs.iter_mut().filter(|pair| pair.photos[0] < FIRST && pair.photos[1] >= FIRST)
+        {
+            assert_eq!(pair.pairs.len(), plan.points.len(), "all are in each photo");
+            let picture = (in_picture * pair.pairs.len() as f64) as usize;
+            let (others, count) = (&mut pair.pairs[picture..], plan.points.len() as u32);
+            others.iter_mut().rev().zip(picture as u32..count).for_each(|(of, k)| of[1] = k);
+        }
+        let solution = solved(&photos, &pairs).expect("a solution");
+        let off = off(&solution, &plan);
+        assert_eq!(off.placed, placed, "{in_picture}: {:?}", solution.evidence);
+        assert!(off.degrees < 0.5, "{in_picture}: {} degrees", off.degrees);
+        assert!(solution.confidence > CONFIDENCE_MIN, "{in_picture}: {:?}", solution.evidence);
+        for (photo, placing) in solution.photos.iter().enumerate() {
+            let is_named = matches!(placing, Placing::LeftOut(why) if why.contains("contradict"));
+            assert_eq!(is_named, photo >= placed, "{in_picture}: photo {photo} {placing:?}");
+        }
+    }
+}
+
+#[test]
 fn a_camera_that_only_turns_gives_no_cameras() {
     let turned = |i: usize| Truth {
         turn: DMat3::from_rotation_y(0.08 * i as f64) * DMat3::from_rotation_x(0.03 * i as f64),
