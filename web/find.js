@@ -123,7 +123,7 @@ function measured() {
     says = [];
   if (marks.length === 1) says.push(t('measure.second'));
   else if (marks.length > 2) {
-    says.push(t('measure.path', { length: lengthOf(units), area: lengthOf(areaOf(marks), 2) }));
+    says.push(t('measure.path', { length: lengthOf(units), area: areaText(areaOf(marks)) }));
   } else {
     says.push(t(metresKnown() ? 'measure.is' : 'measure.units', { length: lengthOf(units) }));
   }

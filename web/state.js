@@ -122,11 +122,9 @@ const names = new Kept('names'),
 const metresKnown = () =>
   state.scale?.metres_per_unit || Number(metres.of(state.scene.id)) || 0;
 const metre = () => metresKnown() || 1;
-// A length of the scene as it is said: in metres where a true length is known; an area likewise.
-const lengthOf = (units, power = 1) =>
-  `${(units * metre() ** power).toPrecision(3)}${
-    metresKnown() ? [' m', ' m²'][power - 1] : ['', '²'][power - 1]
-  }`;
+// A length of the scene as it is said: in metres where a true length is known. An area likewise.
+const lengthOf = (units) => `${(units * metre()).toPrecision(3)}${metresKnown() ? ' m' : ''}`;
+const areaText = (units) => `${(units * metre() ** 2).toPrecision(3)}${metresKnown() ? ' m' : ''}²`;
 // How far over the ground a point is, in units; null where no ground is known.
 const heightOf = (point) => {
   const ground = state.scale?.ground;

@@ -30,8 +30,8 @@ const TABLE = {
   'drop.more': [
     'photos, alone or with their cameras; a video; the folder of a capture (COLMAP, Polycam, ' +
       'Record3D and others), or one zip; or a file of Gaussians',
-    'Fotos, allein oder mit ihren Kameras; ein Video; den Ordner einer Aufnahme (COLMAP, Polycam, Record3D ' +
-      'und andere) oder ein Zip; oder eine Datei mit Gauß-Splats',
+    'Fotos, allein oder mit ihren Kameras; ein Video; den Ordner einer Aufnahme (COLMAP, ' +
+      'Polycam, Record3D und andere) oder ein Zip; oder eine Datei mit Gauß-Splats',
     '照片（可附相机参数）；视频；采集文件夹（COLMAP、Polycam、Record3D 等）或一个 zip；或高斯文件',
   ],
   files: ['Choose files', 'Dateien wählen', '选择文件'],

@@ -1,5 +1,5 @@
-//! The list of edits of a scene and its scale, each in an object of its own: any replica may replace
-//! it while another one writes the record.
+//! The list of edits of a scene and its scale, each in an object of its own: any replica may
+//! replace it while another one writes the record.
 //!
 //! The store does not read the list. A bad one stays where it is until another takes its place:
 //! without it a scene would show what was deleted.

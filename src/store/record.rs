@@ -79,8 +79,8 @@ impl Growth {
     }
 
     /// Notes that a change is done, after which the scene has these cameras. Of calls whose photos
-    /// are all gone the newest [`GONE_KEYS_MAX`] that had a key are known on, so that a call that is
-    /// sent twice does nothing the second time.
+    /// are all gone the newest [`GONE_KEYS_MAX`] that had a key are known on, so that a call that
+    /// is sent twice does nothing the second time.
     pub fn done(&mut self, change: Option<PhotoChange>, cameras: &[SceneCamera]) {
         if let Some(PhotoChange::Add(added)) = change {
             // A name that comes again is another photo.

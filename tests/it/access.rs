@@ -307,6 +307,7 @@ fn every_call_of_both_doors_has_its_scope_in_the_table() {
         "POST /v1/scenes/{id}/photos",
         "DELETE /v1/scenes/{id}/photos/{name}",
         "PUT /v1/scenes/{id}/edits",
+        "PUT /v1/scenes/{id}/scale",
         "POST /v2/models/{name}/infer",
     ];
     assert_eq!(writes, want);

@@ -90,6 +90,7 @@ const NOT_ON_THE_PAGE: Absent = &[
     ("*.near_best", "scored as the scene was made; the cut alone is the page's"),
     ("*.rivals", "scored as the scene was made; the cut alone is the page's"),
     ("*.unit_rows", "scored as the scene was made; the cut alone is the page's"),
+    ("measure", "it measures itself, by the same scale and ground"),
     ("Scene.updated_ms", "it shows when a scene was made"),
     ("SemanticsStatus.available", "a question is refused with the reason"),
     ("SemanticsStatus.reason", "a question is refused with it"),

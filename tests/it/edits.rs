@@ -326,3 +326,23 @@ async fn an_acknowledged_list_outlives_a_kill() {
 fn good_edit() -> Value {
     json!({ "op": "delete", "select": { "sphere": { "center": [0, 0, 0], "radius": 0 } } })
 }
+
+/// The stand-in's walls are at one depth: nothing floats. A scene of two photos has no floaters.
+#[tokio::test(flavor = "multi_thread")]
+async fn floaters_are_a_selection_like_others() {
+    let (server, id) = start().await;
+    let floaters = json!({ "op": "delete", "select": { "floaters": true } });
+    let photos = server.service.get(&id).await.unwrap().cameras.len();
+    let (status, told) = send(&server, &id, json!([floaters])).await;
+    if photos < 3 {
+        assert_eq!(status, StatusCode::BAD_REQUEST, "{told}");
+        assert!(told["message"].as_str().unwrap().contains("3 photos and more"), "{told}");
+    } else {
+        assert_eq!((status, &told["counts"]), (StatusCode::OK, &json!([0])), "{told}");
+        assert_eq!(list(&server, &id).await["edits"], json!([floaters]), "as it was sent");
+    }
+    let both = json!({ "op": "delete", "select": { "floaters": true, "text": "photo 0" } });
+    let (status, told) = send(&server, &id, json!([both])).await;
+    assert_eq!(status, StatusCode::BAD_REQUEST, "{told}");
+    assert!(told["message"].as_str().unwrap().contains("text and floaters"), "{told}");
+}

@@ -5,8 +5,9 @@
         python tests/tools/distances.py target/eval/scenes/scene_*
 
 The rooms are in metres and their floor is y = 0, so a pixel of the floor has an exact place. Their
-cameras are sent in units of 0.27 m. Points of the floor are picked in each photo; the length between
-the two that are farthest apart is given, and all other distances over half a metre are compared.
+cameras are sent in units of 0.27 m. Points of the floor are picked in each photo; the length
+between the two that are farthest apart is given, and all other distances over half a metre are
+compared.
 Of the ground: how many degrees its normal is off, and its height at its middle.
 """
 
@@ -96,8 +97,8 @@ def main(folders: list[Path]) -> None:
             scene.delete()
     share = 100 * np.quantile(everything, [0.5, 0.9, 1])
     within = 100 * np.mean(np.array(everything) <= 0.01)
-    print(f"all: {len(everything)} distances, off by {share[0]:.2f} % (median), {share[1]:.2f} (of 9 "
-          f"in 10), {share[2]:.2f} (most); {within:.0f} % within 1 %")
+    print(f"all: {len(everything)} distances, off by {share[0]:.2f} % (median), {share[1]:.2f} (of "
+          f"9 in 10), {share[2]:.2f} (most); {within:.0f} % within 1 %")
 
 
 if __name__ == "__main__":

@@ -103,8 +103,9 @@ pub(super) async fn add(
 
 /// Take a photo out of a scene
 ///
-/// The version without it takes the place of the one before. The file itself stays in the store as
-/// long as a photo that came with it is in the scene; of the create call until the scene is deleted.
+/// The version without it takes the place of the one before. The file itself stays in the store
+/// as long as a photo that came with it is in the scene; of the create call until the scene is
+/// deleted.
 #[utoipa::path(
     delete, path = "/v1/scenes/{id}/photos/{name}", operation_id = "remove_photo", tag = "scenes",
     params(Id, PhotoName, PhotosParams),

@@ -81,8 +81,8 @@ pub struct EditPick {
     pub height: Option<u32>,
 }
 
-/// Which Gaussians an edit takes: one of `text`, `box`, `sphere`, `point`, `pick` and `floaters`. It
-/// looks at the scene as the edits before it leave it.
+/// Which Gaussians an edit takes: one of `text`, `box`, `sphere`, `point`, `pick` and `floaters`.
+/// It looks at the scene as the edits before it leave it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct EditSelection {

@@ -492,15 +492,17 @@ def set_scale(
     ends = None if points is None else [[float(v) for v in point] for point in points]
     said = dict(metres=metres, points=ends, thing=named, metres_per_unit=metres_per_unit)
     body = {name: value for name, value in said.items() if value is not None}
-    answer = yield from send(scene.policy, Request("PUT", f"/v1/scenes/{scene.id}/scale", json=body))
+    request = Request("PUT", f"/v1/scenes/{scene.id}/scale", json=body)
+    answer = yield from send(scene.policy, request)
     return parse(Scale, _json(answer.body))
 
 
 def measure(scene: Handle, points: Iterable[Sequence[float]]) -> Flow[Measured]:
     """Lengths, area and heights over the ground of points of the world, joined in their order: in
     metres where `scale` knows them."""
-    path, body = f"/v1/scenes/{scene.id}/measure", {"points": [[float(v) for v in p] for p in points]}
-    answer = yield from send(scene.policy, Request("POST", path, json=body))
+    body = {"points": [[float(v) for v in point] for point in points]}
+    request = Request("POST", f"/v1/scenes/{scene.id}/measure", json=body)
+    answer = yield from send(scene.policy, request)
     return parse(Measured, _json(answer.body))
 
 

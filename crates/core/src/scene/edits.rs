@@ -137,8 +137,8 @@ pub struct Edited {
     pub counts: Vec<u64>,
 }
 
-/// The Gaussians of a scene with these cameras after all edits, which may be at most `most`. Gaussians that no edit took keep
-/// their numbers, bit for bit, and their order; copies come last.
+/// The Gaussians of a scene with these cameras after all edits, which may be at most `most`.
+/// Gaussians that no edit took keep their numbers, bit for bit, and their order; copies come last.
 ///
 /// # Errors
 /// `limit_exceeded` where copies make too many.

@@ -1,9 +1,9 @@
 //! Gaussians that no photo confirms: they float in front of what photos see.
 //!
 //! Each Gaussian names the photo that gave it. What a photo gave is, cell by cell of its picture,
-//! how far it sees. A Gaussian of another photo that lies well in front of that is seen through, and
-//! one at that depth is confirmed; behind it, it is hidden, and nothing is said. A floater is seen
-//! through by two photos or more, and confirmed by none.
+//! how far it sees. A Gaussian of another photo that lies well in front of that is seen through,
+//! and one at that depth is confirmed; behind it, it is hidden, and nothing is said. A floater is
+//! seen through by two photos or more, and confirmed by none.
 
 use glam::DVec3;
 use rayon::prelude::*;
