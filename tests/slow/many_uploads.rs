@@ -1,5 +1,5 @@
-//! Uploads of hundreds of photos: the memory of the process has a bound that does not grow with what
-//! is sent.
+//! Uploads of hundreds of photos: the memory of the process has a bound that does not grow with
+//! what is sent.
 
 use std::time::Instant;
 
