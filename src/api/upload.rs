@@ -16,8 +16,7 @@ use crate::{
     error::{Error, ErrorCode, Result, short},
     limits::Limits,
     scene::{FilePart, SceneId, Upload, UploadCameras, UploadFile},
-    service::Service,
-    store::Receiving,
+    service::{Receiving, Service},
     telemetry::meter,
 };
 

@@ -67,3 +67,4 @@ pub use crate::scene::{
     Density, Event, MaskLevel, Method, Preset, SceneCamera, SceneError, SceneOptions, SceneState,
     SceneStatus, SemanticsMode, SemanticsState, SemanticsStatus, Upload, UploadCameras, UploadFile,
 };
+pub(crate) use crate::store::Receiving;

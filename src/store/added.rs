@@ -45,7 +45,7 @@ impl Store {
         let file = self.objects.get("read the photos", of(id, object))?;
         let gone =
             || Error::new(ErrorCode::SceneCorrupt, format!("{object} of scene {id} is gone"));
-        Ok(upload_file::read(&file.ok_or_else(gone)?, &self.objects, id, object)?.0)
+        Ok(self.read_upload(&file.ok_or_else(gone)?, id, object)?.0)
     }
 
     /// Forgets photos that do not join their scene after all.
@@ -84,7 +84,7 @@ impl Store {
         names.sort_unstable();
         for name in names {
             let file = self.objects.get("read the photos", of(id, name))?;
-            let read = file.map(|file| upload_file::read(&file, &self.objects, id, name));
+            let read = file.map(|file| self.read_upload(&file, id, name));
             let Some(Ok((_, record))) = read else { continue };
             let Some(PhotoChange::Add(added)) = record.growth.waiting.back().cloned() else {
                 continue;

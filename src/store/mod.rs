@@ -200,7 +200,7 @@ impl Store {
     pub fn upload(&self, id: &SceneId) -> Result<Upload> {
         let file = self.objects.get("read the upload", of(id, UPLOAD))?;
         let file = file.ok_or_else(|| not_found(id))?;
-        Ok(upload_file::read(&file, &self.objects, id, UPLOAD)?.0)
+        Ok(self.read_upload(&file, id, UPLOAD)?.0)
     }
 
     /// Forgets photos and cameras of a scene; what needs them can then not be made.

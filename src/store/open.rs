@@ -16,7 +16,6 @@ use parking_lot::Mutex;
 
 use super::{
     Cache, Objects, PROBE, Record, SCENE, STATUS, Store, UPLOAD, aside, of, pending, record,
-    upload_file,
 };
 use crate::{
     config::Config,
@@ -301,7 +300,7 @@ fn from_upload(store: &Store, id: &SceneId) -> Result<Option<Record>> {
 /// The record that the upload was kept with.
 fn first_record(store: &Store, id: &SceneId) -> Result<Option<Record>> {
     let Some(file) = store.objects.get("read the upload", of(id, UPLOAD))? else { return Ok(None) };
-    let read = upload_file::read(&file, &store.objects, id, UPLOAD);
+    let read = store.read_upload(&file, id, UPLOAD);
     let record = read.ok().map(|(_, record)| record);
     Ok(record.filter(|record| record.status.id == *id))
 }

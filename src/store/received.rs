@@ -17,14 +17,14 @@ use object_store::path::Path as Name;
 use sha2::{Digest, Sha256};
 
 use super::{
-    Store,
+    Record, Store,
     objects::{Objects, Writer},
-    of,
+    of, upload_file,
 };
 use crate::{
     error::{Error, ErrorCode, Result},
     names::hex,
-    scene::{FilePart, KeptBytes, KeptFile, KeptFiles, SceneId},
+    scene::{FilePart, KeptBytes, KeptFile, KeptFiles, SceneId, Upload},
 };
 
 /// Bytes that are gathered before they go on.
@@ -52,20 +52,6 @@ pub(super) fn list_of(object: &str) -> Option<String> {
 /// Whether the object of this name is a list of such files, or may be one.
 pub(super) fn is_list(object: &str) -> bool {
     object.ends_with(LIST)
-}
-
-/// A file of a list as it is kept.
-pub(super) fn stored(
-    objects: &Arc<Objects>,
-    scene: &SceneId,
-    list: &str,
-    number: usize,
-    sha256: &str,
-    size: u64,
-) -> Arc<dyn KeptBytes> {
-    let (objects, path) = (Arc::clone(objects), of(scene, &name_of(list, number)));
-    let (sha256, is_sound) = (sha256.to_owned(), AtomicBool::new(false));
-    Arc::new(Stored { objects, path, sha256, size, is_sound, _place: None })
 }
 
 /// A file of an upload in the store.
@@ -147,7 +133,7 @@ impl Drop for Place {
             let cleared = store.clear_received(&scene, &list);
             store.receiving.lock().remove(&of(&scene, &list));
             if let Err(error) = cleared {
-                tracing::warn!(%scene, %error, "files of an upload that broke off stay for a sweep");
+                tracing::warn!(%scene, %error, "what is left of an upload stays for a sweep");
             }
         };
         if let Err(error) = std::thread::Builder::new().name("received".to_owned()).spawn(clear) {
@@ -249,6 +235,21 @@ impl Receiving {
 }
 
 impl Store {
+    /// The upload in the object `list` of a scene, and the record it was acknowledged with.
+    pub(super) fn read_upload(
+        &self,
+        file: &[u8],
+        scene: &SceneId,
+        list: &str,
+    ) -> Result<(Upload, Record)> {
+        let stored = |number: usize, sha256: &str, size: u64| -> Arc<dyn KeptBytes> {
+            let (objects, path) = (Arc::clone(&self.objects), of(scene, &name_of(list, number)));
+            let (sha256, is_sound) = (sha256.to_owned(), AtomicBool::new(false));
+            Arc::new(Stored { objects, path, sha256, size, is_sound, _place: None })
+        };
+        upload_file::read(file, scene, list, &stored)
+    }
+
     /// Removes the files of a list where there is no such list.
     fn clear_received(&self, scene: &SceneId, list: &str) -> Result<()> {
         let what = "forget an upload";

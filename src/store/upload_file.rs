@@ -7,11 +7,14 @@ use std::{io, sync::Arc};
 use object_store::PutPayload;
 use serde::{Deserialize, Serialize};
 
-use super::{files::sha256, objects::Objects, received};
+use super::files::sha256;
 use crate::{
     error::{ErrorCode, Result},
     formats::container::{Container, ContainerArray, ContainerKind, Dtype, frame},
-    scene::{FilePart, KeptFile, KeptFiles, PhotoHash, SceneId, Upload, UploadCameras, UploadFile},
+    scene::{
+        FilePart, KeptBytes, KeptFile, KeptFiles, PhotoHash, SceneId, Upload, UploadCameras,
+        UploadFile,
+    },
 };
 
 const KIND: &str = "segsplat-upload";
@@ -106,12 +109,15 @@ pub(super) fn pack(upload: Upload, record: &super::Record) -> io::Result<PutPayl
     Ok(parts.flat_map(PutPayload::from).collect())
 }
 
+/// Gives the bytes of a file that is an object: by its number, sha256 and size.
+type FindKept<'s> = &'s dyn Fn(usize, &str, u64) -> Arc<dyn KeptBytes>;
+
 /// The upload of a scene and the record it was acknowledged with, from its object `list`.
 pub(super) fn read(
     file: &[u8],
-    objects: &Arc<Objects>,
     scene: &SceneId,
     list: &str,
+    stored: FindKept<'_>,
 ) -> Result<(Upload, super::Record)> {
     let what = "the stored upload";
     let container = match Container::read(file, &WHOLE, what) {
@@ -140,7 +146,7 @@ pub(super) fn read(
                 // Cameras are never apart.
                 UploadPart::Photo | UploadPart::Transforms | UploadPart::Cameras => FilePart::Photo,
             };
-            let bytes = received::stored(objects, scene, list, i, &of.sha256, of.size);
+            let bytes = stored(i, &of.sha256, of.size);
             KeptFile { part, name: of.name, size: of.size, sha256: of.sha256, bytes }
         };
         let files = header.kept.into_iter().enumerate().map(file).collect();

@@ -106,9 +106,9 @@ const LIVE: [(&str, u64, Ask); 38] = [
     ("refine_side_max", 20, Ask::Refine),
 ];
 
-/// Live as well, and not seen by these calls: those of keys, in `access.rs`, and of answers that
-/// are not sent yet, in `answers.rs`, of memory, in `received.rs`; one that counts on a device alone, and those of threads and
-/// of replicas, by tests of their own below.
+/// Live as well, and not seen by these calls: those of keys, in `access.rs`, of answers that are
+/// not sent yet, in `answers.rs`, and of memory, in `received.rs`; one that counts on a device
+/// alone, and those of threads and of replicas, by tests of their own below.
 const ELSEWHERE: [&str; 10] = [
     "upload_memory_bytes_max",
     "answers_bytes_max",

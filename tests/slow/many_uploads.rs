@@ -1,5 +1,5 @@
-//! Uploads of hundreds of photos: the memory of the process has a bound that does not grow with what
-//! is sent.
+//! Uploads of hundreds of photos: the memory of the process has a bound that does not grow with
+//! what is sent.
 
 use std::time::Instant;
 
@@ -15,7 +15,7 @@ const PHOTOS: [usize; 2] = [60, 300];
 const PHOTO_BYTES: usize = 4 << 20;
 /// What may come to the memory of the idle process: what stays of an upload, a few parts on their
 /// way to the store, two photos at once, and what the jobs of small photos take.
-const MEMORY_MAX: u64 = 160 << 20;
+const MEMORY_MAX: u64 = 128 << 20;
 
 /// A JPEG of so many bytes: comments, which no decoder keeps, make it as long as a photo of 12
 /// megapixels.
