@@ -114,7 +114,7 @@ pub fn lift(
 /// The Gaussians in one colour, so that none is at the end of the range of colours.
 fn grey(gaussians: &Gaussians) -> Result<Gaussians> {
     let mut raw = gaussians.clone().into_raw();
-    raw.sh = vec![[0.0; 3]; gaussians.len()];
+    (raw.sh_degree, raw.sh) = (0, vec![[0.0; 3]; gaussians.len()]);
     Gaussians::restore(raw)
 }
 
