@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use crate::scene::{Gaussians, SceneCamera};
 
 /// Cells across the longer side of a photo.
-const CELLS: u32 = 96;
+const CELLS: u32 = 48;
 /// Photos that are asked of each Gaussian, evenly chosen of the others.
 const ASKED_MAX: usize = 24;
 /// Share of the Gaussians of a cell, on each side, whose depth says nothing.

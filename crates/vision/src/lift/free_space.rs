@@ -10,11 +10,7 @@ use std::sync::atomic::AtomicBool;
 
 use rayon::prelude::*;
 
-use super::{
-    PIXELS_A_TASK,
-    fuse::{Fate, Look, Surface},
-    median,
-};
+use super::surface::{Fate, Look, PIXELS_A_TASK, Surface, median};
 use crate::{error::Result, scene::unless_cancelled};
 
 /// What counts as hiding another photo's surface, and how much of it is too much.

@@ -7,6 +7,7 @@
 mod backdrop;
 mod free_space;
 mod fuse;
+mod surface;
 mod thin;
 mod union;
 
@@ -20,7 +21,8 @@ use rayon::prelude::*;
 use crate::{
     error::{Error, Result},
     lift::{
-        fuse::{Fate, fuse},
+        fuse::fuse,
+        surface::{Fate, PIXELS_A_TASK, median, sum_of_confidence},
         union::unite,
     },
     point,
@@ -55,9 +57,6 @@ impl Default for Fusion {
 const DEPTH_SLACK: f64 = 2.0;
 /// How far beyond its own picture a Gaussian may lie, as a share of the picture's side.
 const FRAME_SLACK: f64 = 0.1;
-/// Pixels that one thread takes at a time.
-const PIXELS_A_TASK: usize = 1 << 11;
-
 /// A lifted scene.
 #[derive(Clone, Debug)]
 pub struct Lifted {
@@ -188,7 +187,7 @@ fn check_lengths(view: &ViewGaussians, degree: u8) -> Result<()> {
 fn best_of_each_photo(mut views: Vec<ViewGaussians>, counts: &mut Counts) -> Vec<ViewGaussians> {
     let mut kept: Vec<(f64, ViewGaussians)> = Vec::with_capacity(views.len());
     for view in views.drain(..) {
-        let score = fuse::sum_of_confidence(&view);
+        let score = sum_of_confidence(&view);
         match kept.iter_mut().find(|(_, other)| other.photo == view.photo) {
             None => kept.push((score, view)),
             Some(entry) => {
@@ -329,13 +328,4 @@ fn moved(
 fn center_of(cameras: &[Camera]) -> DVec3 {
     let sum: DVec3 = cameras.iter().map(|camera| camera.camera_to_world.center()).sum();
     if cameras.is_empty() { sum } else { sum / cameras.len() as f64 }
-}
-
-/// Median, 0 of nothing.
-fn median(mut values: Vec<f64>) -> f64 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }

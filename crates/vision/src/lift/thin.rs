@@ -10,7 +10,7 @@
 use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 
-use super::fuse::Fate;
+use super::surface::Fate;
 use crate::{
     point,
     scene::{BLUR_PX2, SH_C0, SH_COUNT_MAX, ViewGaussians, covariance, principal_axes},

@@ -16,9 +16,8 @@ use std::sync::atomic::AtomicBool;
 use rayon::prelude::*;
 
 use super::{
-    PIXELS_A_TASK,
     free_space::{FreeSpace, carve, neighbors},
-    fuse::{Fate, Look, Surface, surest_first},
+    surface::{Fate, Look, PIXELS_A_TASK, Surface, surest_first},
 };
 use crate::{
     error::Result,
