@@ -91,7 +91,7 @@ pub struct ScaleSpec {
 }
 
 /// What is known of how large a scene is and how it stands.
-#[derive(Clone, Debug, PartialEq, Serialize, ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, ToSchema)]
 pub struct SceneScale {
     /// Metres of a unit of the world, where they are known.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -208,7 +208,7 @@ fn of_form<'a>(
         .collect();
     let is_mask = |file: &SentFile<'_>| placed.contains(file.name) || named.contains(file.name);
     let (masked, files): (Vec<SentFile<'a>>, Vec<SentFile<'a>>) =
-        files.iter().copied().partition(is_mask);
+        files.into_iter().partition(is_mask);
     check_count(files.len(), limits)?;
     let sent: Vec<&str> = files.iter().map(|file| file.name).collect();
     let (pairs, _) = paired(&entries, &sent)?;
