@@ -20,12 +20,12 @@ function frame() {
   // While it moves, slow frames are drawn smaller; at rest the frame is whole.
   const taken = performance.now() - lastFrame;
   if (moving && taken < 2000)
-    state.scale = Math.min(
+    state.sharpness = Math.min(
       1,
-      Math.max(0.25, state.scale * (taken > 90 ? 0.8 : taken < 30 ? 1.1 : 1)),
+      Math.max(0.25, state.sharpness * (taken > 90 ? 0.8 : taken < 30 ? 1.1 : 1)),
     );
   lastFrame = performance.now();
-  const scale = dense * (moving ? state.scale : 1);
+  const scale = dense * (moving ? state.sharpness : 1);
   drawing.resize(
     Math.max(1, Math.round(box.width * scale)),
     Math.max(1, Math.round(box.height * scale)),

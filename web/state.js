@@ -34,7 +34,7 @@ const state = {
   things: 0,
   frusta: false,
   measuring: false,
-  scale: 1,
+  sharpness: 1,
   moving: 0,
   alone: false,
   embedded: false,

@@ -79,7 +79,7 @@ impl Growth {
     }
 
     /// Notes that a change is done, after which the scene has these cameras. Of calls whose photos
-    /// are all gone the newest [`GONE_KEYS_MAX`] that had a key are known on, so that a call that
+    /// are all gone the newest `GONE_KEYS_MAX` that had a key are known on, so that a call that
     /// is sent twice does nothing the second time.
     pub fn done(&mut self, change: Option<PhotoChange>, cameras: &[SceneCamera]) {
         if let Some(PhotoChange::Add(added)) = change {
