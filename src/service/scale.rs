@@ -73,20 +73,15 @@ pub struct ScaleThing {
 
 /// How large a scene is: `metres` with either `points` or `thing`, or `metres_per_unit`. Nothing:
 /// as the capture says it.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct ScaleSpec {
     /// A length, metres.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub metres: Option<f64>,
     /// It is that between these two points of the world.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub points: Option<[[f64; 3]; 2]>,
     /// It is that of a side of this thing.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub thing: Option<ScaleThing>,
     /// Metres of a unit of the world.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub metres_per_unit: Option<f64>,
 }
 
