@@ -47,8 +47,8 @@ pub(crate) fn drop_weak(
     loop {
         let links = links_under(survey, best);
         let weak = beside_largest(survey, &links, &best.grown);
-        // Where most are weak, none is worse than the others: the confidence says it.
-        if weak.is_empty() || 2 * weak.len() > best.grown.poses.iter().flatten().count() {
+        // Where no part is more than half, none is better than the others: the confidence says it.
+        if weak.is_empty() || 2 * weak.len() >= best.grown.poses.iter().flatten().count() {
             return (links, dropped);
         }
         let mut grower = Grower::new(survey, &best.tracks, &[], &best.grown.lenses, cancel);
