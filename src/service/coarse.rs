@@ -7,8 +7,8 @@ use parking_lot::Mutex;
 
 use crate::{
     error::Result,
-    formats::packed::{CoarseForm, CoarseForms},
-    render::coarse::{Coarse, Form},
+    formats::packed::CoarseForms,
+    render::coarse::Coarse,
     scene::{Gaussians, Scene},
 };
 
@@ -60,11 +60,6 @@ impl LastCoarse {
 
 /// The forms as a file takes them.
 pub(super) fn forms<'a>(coarse: &'a Coarse, entries: &'a [u16]) -> CoarseForms<'a> {
-    let form = |form: &'a Form| CoarseForm { order: &form.order, ends: &form.ends };
-    CoarseForms {
-        gaussians: &coarse.merged.gaussians,
-        entries,
-        forms: coarse.forms.iter().map(form).collect(),
-        order: &coarse.order,
-    }
+    let Coarse { gaussians, ends, order } = coarse;
+    CoarseForms { gaussians, entries, ends, order }
 }

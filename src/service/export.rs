@@ -106,8 +106,8 @@ impl Service {
             let Some(coarse) = inner.coarse.of(&scene)? else {
                 return write_packed(&scene, near, None, to);
             };
-            let entries = coarse.merged.entries(&scene.gaussians);
-            write_packed(&scene, near, Some(&forms(&coarse, &entries)), to)
+            let entries = coarse.entries(&scene.gaussians);
+            write_packed(&scene, near, Some(forms(&coarse, &entries)), to)
         };
         Ok(Export::streamed(etag, write).placed(&self.inner, work_bytes, None))
     }

@@ -35,25 +35,16 @@ const PART: usize = 8192;
 const ROW: usize = 2048;
 
 /// Coarser forms of a scene.
-#[derive(Debug)]
+#[derive(Clone, Copy, Debug)]
 pub struct CoarseForms<'a> {
-    /// What the numbers of the forms count.
+    /// Those of one form after the other, the coarsest form first.
     pub gaussians: &'a Gaussians,
     /// Their entries of the bank.
     pub entries: &'a [u16],
-    /// The forms, the coarsest first.
-    pub forms: Vec<CoarseForm<'a>>,
+    /// Of each form and each of its Gaussians, where its members in the next form end.
+    pub ends: &'a [Vec<u32>],
     /// The scene's own Gaussians in the order of the finest form.
     pub order: &'a [u32],
-}
-
-/// One of them.
-#[derive(Clone, Copy, Debug)]
-pub struct CoarseForm<'a> {
-    /// Numbers of Gaussians.
-    pub order: &'a [u32],
-    /// Of each, where its members in the next form end.
-    pub ends: &'a [u32],
 }
 
 /// What the page must know besides the Gaussians.
@@ -88,10 +79,10 @@ struct FormHeader {
     ends: Vec<u32>,
 }
 
-impl From<&CoarseForm<'_>> for FormHeader {
-    fn from(form: &CoarseForm<'_>) -> Self {
-        let ends = form.ends.chunks(ROW).filter_map(|row| row.last().copied()).collect();
-        Self { gaussians: form.order.len(), ends }
+impl FormHeader {
+    fn of(ends: &Vec<u32>) -> Self {
+        let rows = ends.chunks(ROW).filter_map(|row| row.last().copied());
+        Self { gaussians: ends.len(), ends: rows.collect() }
     }
 }
 
@@ -102,7 +93,7 @@ impl From<&CoarseForm<'_>> for FormHeader {
 pub fn write_packed(
     scene: &Scene,
     near: f32,
-    coarse: Option<&CoarseForms<'_>>,
+    coarse: Option<CoarseForms<'_>>,
     to: &mut dyn Write,
 ) -> Result<()> {
     let unwritten = |cause| {
@@ -125,7 +116,7 @@ pub fn write_packed(
         understood: scene.semantics.is_some(),
         cameras: &scene.meta.cameras,
         network_focal_px: &report.network_focal_px,
-        coarse: coarse.iter().flat_map(|all| &all.forms).map(FormHeader::from).collect(),
+        coarse: coarse.iter().flat_map(|all| all.ends).map(FormHeader::of).collect(),
     };
     let mut header = serde_json::to_vec(&header)
         .map_err(|e| Error::internal("the scene has no header").caused_by(e))?;
@@ -150,10 +141,7 @@ pub fn write_packed(
     let Some(coarse) = coarse else {
         return put(&mut largest_first(gaussians).into_iter(), (gaussians, entries));
     };
-    for form in &coarse.forms {
-        let of = (coarse.gaussians, coarse.entries);
-        put(&mut form.order.iter().map(|&i| i as usize), of)?;
-    }
+    put(&mut (0..coarse.gaussians.len()), (coarse.gaussians, coarse.entries))?;
     put(&mut coarse.order.iter().map(|&i| i as usize), (gaussians, entries))
 }
 

@@ -7,15 +7,15 @@
 //! together in the next form, in the same order: as soon as the members of the first n have
 //! come, these n are no longer drawn.
 
-use std::sync::Arc;
+use std::ops::Range;
 
 use glam::DVec3;
 
 use crate::{
     blocks::{BLOCKS_MIN, Blocks},
     error::Result,
-    merged::Merged,
-    scene::{Camera, Gaussians},
+    merged::{Merged, heaviest},
+    scene::{Camera, Gaussians, RawGaussians},
 };
 
 /// Most Gaussians of the coarsest form: 2 MiB of 32 bytes each.
@@ -23,25 +23,17 @@ pub const FIRST_MAX: usize = 1 << 16;
 /// A form that is not the coarsest has at most one of so many of the scene's Gaussians.
 const SHARE: usize = 4;
 
-/// The coarser forms of a scene.
+/// The coarser forms of a scene: about 12 bytes for each of its Gaussians.
 #[derive(Debug)]
 pub struct Coarse {
-    /// Where the numbers of the forms point.
-    pub merged: Arc<Merged>,
-    /// The forms, the coarsest first.
-    pub forms: Vec<Form>,
+    /// The Gaussians of one form after the other, the coarsest form first. They have no entries.
+    pub gaussians: Gaussians,
+    /// Of each form and each of its Gaussians, where its members in the next form end; they begin
+    /// where those of the one before it end. The next form of the finest one is
+    /// [`Coarse::order`].
+    pub ends: Vec<Vec<u32>>,
     /// `[N]` the scene's own Gaussians, in the order of the finest form.
     pub order: Vec<u32>,
-}
-
-/// One of them.
-#[derive(Debug, Default)]
-pub struct Form {
-    /// Numbers in [`Merged::gaussians`].
-    pub order: Vec<u32>,
-    /// For each, where its members in the next form end; they begin where those of the one before
-    /// it end. The next form of the finest one is [`Coarse::order`].
-    pub ends: Vec<u32>,
 }
 
 impl Coarse {
@@ -60,20 +52,57 @@ impl Coarse {
         let Some(&first) = chosen.first() else { return Ok(None) };
         let mut order = layers.ids(first);
         largest_first(&mut order, &merged, own.len(), camera);
-        let mut forms = Vec::new();
+        let (origin, sh_degree) = (own.origin(), own.sh_degree());
+        let mut raw = RawGaussians { origin, sh_degree, ..RawGaussians::default() };
+        let mut all = Vec::new();
         for (at, &layer) in chosen.iter().enumerate() {
+            order.iter().for_each(|&id| push(&mut raw, &merged.gaussians, id as usize - own.len()));
             let down = layer - chosen.get(at + 1).copied().unwrap_or(0);
-            let (mut below, mut ends) = (Vec::new(), Vec::new());
+            let (mut below, mut ends) = (Vec::new(), Vec::with_capacity(order.len()));
             for &id in &order {
                 members(id, down, own.len(), &merged, &mut below);
                 ends.push(below.len() as u32);
             }
-            let order = std::mem::replace(&mut order, below);
-            let order = order.iter().map(|&id| id - own.len() as u32).collect();
-            forms.push(Form { order, ends });
+            all.push(ends);
+            order = below;
         }
-        Ok(Some(Self { merged, forms, order }))
+        Ok(Some(Self { gaussians: Gaussians::restore(raw)?, ends: all, order }))
     }
+
+    /// Entries of the bank, one for each of [`Self::gaussians`], where the scene has those of
+    /// `own`: of what each stands for the one with the most opacity, the lower one of equals.
+    pub fn entries(&self, own: &Gaussians) -> Vec<u16> {
+        let row = |&id: &u32| (own.semantic_index()[id as usize], own.opacities()[id as usize]);
+        let of = |form: usize, at: usize| {
+            let rows: Vec<(u16, f32)> = self.order[self.own_of(form, at)].iter().map(row).collect();
+            heaviest(rows)
+        };
+        let forms = self.ends.iter().enumerate();
+        forms.flat_map(|(form, ends)| (0..ends.len()).map(move |at| of(form, at))).collect()
+    }
+
+    /// Where in [`Self::order`] those begin and end that Gaussian `at` of a form stands for.
+    pub fn own_of(&self, form: usize, at: usize) -> Range<usize> {
+        let down = |end: usize| {
+            let below = |end: usize, ends: &Vec<u32>| {
+                end.checked_sub(1).map_or(0, |last| ends[last] as usize)
+            };
+            self.ends[form..].iter().fold(end, below)
+        };
+        down(at)..down(at + 1)
+    }
+}
+
+/// Appends Gaussian `i` of some others.
+fn push(raw: &mut RawGaussians, of: &Gaussians, i: usize) {
+    let k = of.sh_count();
+    raw.means.push(of.means()[i]);
+    raw.quats.push(of.quats()[i]);
+    raw.scales.push(of.scales()[i]);
+    raw.opacities.push(of.opacities()[i]);
+    raw.sh.extend_from_slice(&of.sh()[i * k..(i + 1) * k]);
+    raw.semantic_index.push(0);
+    raw.source.push(of.source()[i]);
 }
 
 /// Appends those that `id` stands for, so many layers below it.
