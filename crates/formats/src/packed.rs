@@ -80,7 +80,7 @@ struct FormHeader {
 }
 
 impl FormHeader {
-    fn of(ends: &Vec<u32>) -> Self {
+    fn of(ends: &[u32]) -> Self {
         let rows = ends.chunks(ROW).filter_map(|row| row.last().copied());
         Self { gaussians: ends.len(), ends: rows.collect() }
     }
@@ -116,7 +116,7 @@ pub fn write_packed(
         understood: scene.semantics.is_some(),
         cameras: &scene.meta.cameras,
         network_focal_px: &report.network_focal_px,
-        coarse: coarse.iter().flat_map(|all| all.ends).map(FormHeader::of).collect(),
+        coarse: coarse.iter().flat_map(|all| all.ends).map(|ends| FormHeader::of(ends)).collect(),
     };
     let mut header = serde_json::to_vec(&header)
         .map_err(|e| Error::internal("the scene has no header").caused_by(e))?;
