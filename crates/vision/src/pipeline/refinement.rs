@@ -856,10 +856,11 @@ pub fn spooled(
     ready: &mut dyn FnMut(&mut PosedPhoto) -> Result<()>,
 ) -> Result<PhotoSpool> {
     let (mut spool, never) = (PhotoSpool::new(dir)?, AtomicBool::new(false));
-    photos::more(upload, mode, side, limits, &never, |mut photo| {
+    let decoded = photos::more(upload, mode, side, limits, &never, |mut photo| {
         ready(&mut photo)?;
         spool.push(&photo)
     })?;
+    tracing::debug!(decoded, "pixels of more photos");
     Ok(spool)
 }
 
