@@ -58,7 +58,7 @@ def triangles(cells, places):
     """`[cells, places]` weights of a bilinear filter along one axis, as wide as a cell where cells are larger than places; `cells` may be traced."""
     step = places / cells
     at = (torch.arange(cells) + 0.5) * step - 0.5
-    wide = torch.clamp(torch.as_tensor(step, dtype=torch.float32), min=1.0)
+    wide = torch.clamp(torch.ones(()) * step, min=1.0)
     weights = torch.clamp(1 - (torch.arange(places)[None] - at[:, None]).abs() / wide, min=0)
     return weights / weights.sum(1, keepdim=True)
 
