@@ -117,8 +117,8 @@ impl<'a> Tools<'a> {
         })
     }
 
-    /// Milliseconds of giving the scene of `inputs` its meaning, `runs` times after a first one that
-    /// does not count, ascending.
+    /// Milliseconds of giving the scene of `inputs` its meaning, `runs` times after a first one
+    /// that does not count, ascending.
     pub(super) fn timed(
         &self,
         photos: &[PosedPhoto],
