@@ -1,7 +1,7 @@
 // What is asked of a scene: words, clicks, lengths.
 const BOXES = 24, // of a word
   DOTS = 12, // parts that a word offers to fly to
-  OFFERED = 100; // words that a click is named by
+  ASKED = 100; // names of what was clicked that one call asks
 
 // ---- what is there, measuring -----------------------------------------------------------------
 const told = (text) => {
@@ -31,11 +31,9 @@ async function clicked(event) {
     x,
     y,
   });
-  if (state.understood && !state.measuring) {
-    for (const name of await namesOffered()) query.append('label', name);
-  }
+  const names = state.understood && !state.measuring ? await namesOffered() : [];
   if (!state.measuring) told(t('looking'));
-  const found = await server.json(`/v1/scenes/${state.scene.id}/pick?${query}`);
+  const found = await namedAt(query, names);
   if (!found.point) return told(t('pick.nothing'));
   if (state.measuring) return mark(found.point);
   const fits = found.labels.filter(({ relevancy }) => relevancy >= 0.5).slice(0, 3);
@@ -53,11 +51,26 @@ async function clicked(event) {
   $('picked').append(measure);
 }
 
+// What is at a point, and how well each of the names fits it, the best first: in as many calls as
+// the names need.
+async function namedAt(query, names) {
+  const rest = [...names],
+    calls = [];
+  do {
+    const asked = new URLSearchParams(query);
+    rest.splice(0, ASKED).forEach((name) => asked.append('label', name));
+    calls.push(server.json(`/v1/scenes/${state.scene.id}/pick?${asked}`));
+  } while (rest.length);
+  const found = await Promise.all(calls),
+    labels = found.flatMap((one) => one.labels);
+  return { ...found[0], labels: labels.sort((a, b) => b.relevancy - a.relevancy) };
+}
+
 // The words that a click may be named by: those that are shown, and those that are known well.
 async function namesOffered() {
   const { words } = await server.models(),
-    known = ['good', 'fair'].flatMap((trust) => words.filter((one) => one.trust === trust));
-  return new Set([...textsShown(), ...known.slice(0, OFFERED).map(({ word }) => word)]);
+    known = words.filter(({ trust }) => trust === 'good' || trust === 'fair');
+  return new Set([...textsShown(), ...known.map(({ word }) => word)]);
 }
 
 // A word that fits what was clicked: pressed, all of its kind are found.

@@ -14,13 +14,11 @@ import torch
 from torch.nn.functional import linear, normalize
 from tokenizers import Regex, Tokenizer, decoders, models, normalizers, pre_tokenizers, processors
 
-from common import TOLERANCES, arguments, entry, export, hold, prepare, session, sha256, write_section
+from common import arguments, export, hold, prepare, session, write_towers
 
 BEGIN, END = "<|startoftext|>", "<|endoftext|>"
 WORDS = r"""<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"""
 CONTEXT = 77
-# Crops in one run, for a CPU and for a GPU.
-BATCHES = {False: 16, True: 32}
 
 
 class ImageTower(torch.nn.Module):
@@ -128,38 +126,8 @@ def main():
            {"input_ids": {0: "texts"}, "embeddings": {0: "texts"}})
     if not args.skip_check:
         compare(args, clip, made, at)
-    source = args.checkpoint or f"random weights, seed {args.random}"
-    dim = clip.encode_text(example).shape[1]
-    write_section(args, "image_text", f"""
-[image_text]
-licence = "MIT (OpenCLIP); weights: see their model card"
-source = "open_clip_torch {open_clip.__version__}, {args.model}, {os.path.basename(source)}"
-dim = {dim}
-tau = 10.0
-canon = ["object", "things", "stuff"]
-coverage_floor = 0.0
-
-[image_text.image]
-{entry(at("image_tower.onnx"))}
-input = "images"
-output = "embeddings"
-size = {side}
-mean = {[round(v, 8) for v in clip.visual.image_mean]}
-std = {[round(v, 8) for v in clip.visual.image_std]}
-resize = "bicubic"
-crop_margin = 0.0
-batch = {BATCHES[args.half]}
-tolerance = {TOLERANCES[args.half]}
-
-[image_text.text]
-{entry(at("text_tower.onnx"))}
-tokenizer = "tokenizer.json"
-tokenizer_sha256 = "{sha256(at("tokenizer.json"))}"
-context = {CONTEXT}
-unknown = "{END}"
-input_ids = "input_ids"
-output = "embeddings"
-""")
+    write_towers(args, f"open_clip_torch {open_clip.__version__}, {args.model}", "MIT (OpenCLIP); weights: see their model card", clip.encode_text(example).shape[1],
+                 END, size=side, mean=[round(v, 8) for v in clip.visual.image_mean], std=[round(v, 8) for v in clip.visual.image_std], resize="bicubic", context=CONTEXT)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,8 @@ INLINE_BYTES_MAX = 1 << 30
 
 # How much a device may differ from a CPU, in f32 and in f16: share of the answer, root of mean squares.
 TOLERANCES = {False: 0.002, True: 0.02}
+# Crops in one run, for a CPU and for a GPU.
+BATCHES = {False: 16, True: 32}
 
 
 def arguments(doc):
@@ -161,12 +163,62 @@ def write_section(args, name, text):
         print(f"{file:32} {os.path.getsize(os.path.join(args.out, file)) / 2**20:10.2f} MiB")
 
 
+def weights_of(args):
+    """What a manifest calls the weights."""
+    return os.path.basename(os.path.normpath(args.checkpoint)) if args.checkpoint else f"random weights, seed {args.random}"
+
+
+def tokenizer_entry(path, context):
+    """The lines of a manifest that name a tokenizer and how many tokens are read with it."""
+    return f'tokenizer = "{os.path.basename(path)}"\ntokenizer_sha256 = "{sha256(path)}"\ncontext = {context}'
+
+
+def write_towers(args, source, licence, dim, unknown, *, size, mean, std, resize, context, dense=None):
+    """The section of two towers whose files are `image_tower.onnx`, `text_tower.onnx` and `tokenizer.json`. `dense` is
+    the longer side of a whole photo in patches and a patch's side in pixels, where the image tower has features."""
+    at = lambda name: os.path.join(args.out, name)  # noqa: E731
+    photos = "" if dense is None else f"""
+[image_text.image.dense]
+output = "dense"
+side = {dense[0] * dense[1]}
+cell = {dense[1]}
+weights = [[0.0, 1.0]]
+"""
+    write_section(args, "image_text", f"""
+[image_text]
+licence = "{licence}"
+source = "{source}, {weights_of(args)}"
+dim = {dim}
+tau = 10.0
+canon = ["object", "things", "stuff"]
+coverage_floor = 0.0
+
+[image_text.image]
+{entry(at("image_tower.onnx"))}
+input = "images"
+output = "embeddings"
+size = {size}
+mean = {mean}
+std = {std}
+resize = "{resize}"
+crop_margin = 0.0
+batch = {BATCHES[args.half]}
+tolerance = {TOLERANCES[args.half]}
+{photos}
+[image_text.text]
+{entry(at("text_tower.onnx"))}
+{tokenizer_entry(at("tokenizer.json"), context)}
+unknown = "{unknown}"
+input_ids = "input_ids"
+output = "embeddings"
+""")
+
+
 def write_masks(args, at, section, size, batch=64):
     """The section of a mask network whose files are `mask_encoder.onnx` and `mask_decoder.onnx`; `section` has its own keys."""
-    weights = os.path.basename(args.checkpoint or f"random weights, seed {args.random}")
     write_section(args, "masks", f"""
 [masks]
-{section.strip().format(weights=weights)}
+{section.strip().format(weights=weights_of(args))}
 licence = "Apache-2.0"
 size = {size}
 points_per_side = 32

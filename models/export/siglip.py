@@ -17,11 +17,10 @@ from tokenizers import Tokenizer, normalizers
 from torch.nn.functional import linear
 from transformers import SiglipConfig, SiglipModel
 
-from common import TOLERANCES, arguments, entry, export, gap, hold, prepare, session, sha256, write_section
+from common import arguments, export, gap, hold, prepare, session, write_towers
 
 # Longer side of a whole photo, in patches.
 CELLS = 36
-BATCHES = {False: 16, True: 32}
 # Pillow's numbers of filters.
 FILTERS = {2: "bilinear", 3: "bicubic"}
 TINY = {
@@ -147,44 +146,9 @@ def main():
            {"input_ids": {0: "texts"}, "embeddings": {0: "texts"}})
     if made:
         check(*made, at, args.half)
-    source = os.path.basename(os.path.normpath(args.checkpoint)) if args.checkpoint else f"random weights, seed {args.random}"
     unknown = next(token for token in ("<unk>", "[UNK]", "<eos>") if Tokenizer.from_file(at("tokenizer.json")).token_to_id(token) is not None)
-    write_section(args, "image_text", f"""
-[image_text]
-licence = "Apache-2.0"
-source = "SigLIP, {source}"
-dim = {config.hidden_size}
-tau = 10.0
-canon = ["object", "things", "stuff"]
-coverage_floor = 0.0
-
-[image_text.image]
-{entry(at("image_tower.onnx"))}
-input = "images"
-output = "embeddings"
-size = {side}
-mean = {photos.get("image_mean", [0.5, 0.5, 0.5])}
-std = {photos.get("image_std", [0.5, 0.5, 0.5])}
-resize = "{FILTERS[photos.get("resample", 2)]}"
-crop_margin = 0.0
-batch = {BATCHES[args.half]}
-tolerance = {TOLERANCES[args.half]}
-
-[image_text.image.dense]
-output = "dense"
-side = {CELLS * config.patch_size}
-cell = {config.patch_size}
-weights = [[0.0, 1.0]]
-
-[image_text.text]
-{entry(at("text_tower.onnx"))}
-tokenizer = "tokenizer.json"
-tokenizer_sha256 = "{sha256(at("tokenizer.json"))}"
-context = {context}
-unknown = "{unknown}"
-input_ids = "input_ids"
-output = "embeddings"
-""")
+    write_towers(args, "SigLIP", "Apache-2.0", config.hidden_size, unknown, size=side, mean=photos.get("image_mean", [0.5, 0.5, 0.5]),
+                 std=photos.get("image_std", [0.5, 0.5, 0.5]), resize=FILTERS[photos.get("resample", 2)], context=context, dense=(CELLS, config.patch_size))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import torch
 from transformers import Sam3Config, Sam3Model
 from transformers.models.sam3.modeling_sam3 import Sam3VisionEncoderOutput
 
-from common import TOLERANCES, arguments, entry, export, gap, hold, prepare, session, sha256, write_section
+from common import TOLERANCES, arguments, entry, export, gap, hold, prepare, session, tokenizer_entry, weights_of, write_section
 
 # Tokens of a text, and of how many the example has that the exporter traces.
 CONTEXT, TRACED = 32, 5
@@ -117,12 +117,12 @@ def main():
     dynamic = {name: {1: "T"} for name in tokens}
     export(Find(model), dict(zip(FEATURES, maps)) | tokens, find_path, ["masks", "scores"], dynamic, half=args.half)
     check(made, image_path, find_path)
-    shutil.copy(tokenizer, os.path.join(args.out, "text_masks_tokenizer.json"))
-    source = os.path.basename(os.path.normpath(args.checkpoint)) if args.checkpoint else f"random weights, seed {args.random}"
+    words = os.path.join(args.out, "text_masks_tokenizer.json")
+    shutil.copy(tokenizer, words)
     write_section(args, "text_masks", f"""
 [text_masks]
 licence = "SAM License"
-source = "SAM 3, {source}"
+source = "SAM 3, {weights_of(args)}"
 size = {side}
 mean = [0.5, 0.5, 0.5]
 std = [0.5, 0.5, 0.5]
@@ -136,9 +136,7 @@ features = {str(FEATURES).replace("'", '"')}
 
 [text_masks.find]
 {entry(find_path)}
-tokenizer = "text_masks_tokenizer.json"
-tokenizer_sha256 = "{sha256(os.path.join(args.out, "text_masks_tokenizer.json"))}"
-context = {CONTEXT}
+{tokenizer_entry(words, CONTEXT)}
 input_ids = "input_ids"
 attention_mask = "attention_mask"
 masks = "masks"

@@ -6,6 +6,7 @@ import io
 import json
 import urllib.request
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 from acts import drop, pixels, sample, settled, until
@@ -226,10 +227,17 @@ def test_a_thing_is_selected_by_a_click_without_a_word(page: Page, url: str, sce
     settled(page)
     page.focus("#view")
     page.keyboard.press("w")
+    picks: list[str] = []
+    page.on("request", lambda sent: picks.append(sent.url) if "/pick?" in sent.url else None)
     with page.expect_response("**/pick?*") as asked:
         page.locator("#view").click(position={"x": 360, "y": 130})
     found = asked.value.json()
     expect(page.locator("#words li strong")).to_have_text(["thing 1"])
+    # All words that are known were asked, each once.
+    names = [name for sent in picks for name in parse_qs(urlsplit(sent).query)["label"]]
+    trusted = page.evaluate("fetch('/v1/models').then((it) => it.json())")["words"]
+    known = [word["word"] for word in trusted if word["trust"] in ("good", "fair")]
+    assert sorted(names) == sorted(known) and len(known) > 100, (len(names), len(known))
     expect(page.locator("#words .score")).to_have_text("clicked")
     [word] = page.evaluate("segsplat.state.words")
     assert word["entries"] == [found["entry"]]

@@ -28,6 +28,7 @@ use crate::{
     error::{Error, Result},
     grid,
     limits::Limits,
+    models::{NetworkOptions, ProviderChoice},
     pipeline::Pipeline,
     render::cpu::CpuRenderer,
     rows::{Rows, progress},
@@ -62,6 +63,13 @@ pub(crate) struct Args {
     /// scene, named by its best entry, selected
     #[arg(long, conflicts_with = "boxes")]
     split: bool,
+    /// Only time the semantics of each scene's spread photos: so many runs after a first one, which
+    /// opens the networks
+    #[arg(long, conflicts_with_all = ["boxes", "split", "overlap"], value_name = "RUNS")]
+    timed: Option<usize>,
+    /// Provider of the networks: cpu, cuda or webgpu
+    #[arg(long, default_value = "cpu", value_parser = named::<ProviderChoice>)]
+    provider: ProviderChoice,
     /// Words for what is in no scene, separated by commas
     #[arg(long, value_delimiter = ',', default_value = ABSENT)]
     absent: Vec<String>,
@@ -108,7 +116,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     if !(0.0..=1.0).contains(&args.overlap) {
         return Err(Error::invalid(format!("overlap is {}; it must be 0 to 1", args.overlap)));
     }
-    let engine = Pipeline::open(&args.inputs.setup.networks(1))?;
+    let options = args.inputs.setup.networks(1);
+    let engine = Pipeline::open(&NetworkOptions { provider: args.provider, ..options })?;
     let renderer = CpuRenderer::new(args.inputs.setup.threads())?;
     let ways = args.preset.iter().map(|preset| args.way(&engine, *preset));
     let ways = ways.collect::<Result<Vec<Way>>>()?;
@@ -137,6 +146,22 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     if args.boxes {
         let way = ways.first().ok_or_else(|| Error::invalid("--boxes needs a preset"))?;
         return judge_boxes(&tools, way, args, rows);
+    }
+    if let Some(runs) = args.timed {
+        let way = ways.first().ok_or_else(|| Error::invalid("--timed needs a preset"))?;
+        for (name, dir) in args.inputs.find(labels::is_labelled)? {
+            let scene = labels::read(&dir, &Limits::default())?;
+            let given = spread(scene.photos.len(), &[], args.inputs.photos);
+            let times = tools.timed(&scene.photos, &given, way, runs)?;
+            let median = times[times.len() / 2];
+            progress(&format!("{name}: {} photos, semantics in {median:.0} ms", given.len()));
+            let row = json!({
+                "scene": name, "photos": given.len(), "bundle": bundle, "networks": networks,
+                "provider": tools.provider(), "times_ms": times,
+            });
+            rows.push(json!({ "median_ms": median }), row)?;
+        }
+        return Ok(());
     }
     let (mut scenes, mut counted) = (Vec::new(), Vec::new());
     for (name, dir) in args.inputs.find(labels::is_labelled)? {

@@ -1,7 +1,10 @@
 //! What each text says of each pixel of the target: by the stages of the product, and by the flat
 //! baseline without 3D.
 
-use std::sync::{Arc, atomic::AtomicBool};
+use std::{
+    sync::{Arc, atomic::AtomicBool},
+    time::Instant,
+};
 
 use segsplat_vision::semantics::{Cutter, Scorer, Scoring, TextScores, add_context, contexts};
 use serde_json::{Value, json};
@@ -78,6 +81,11 @@ impl<'a> Tools<'a> {
         Ok(Self { engine, renderer, towers: engine.image_text()? })
     }
 
+    /// What runs the towers.
+    pub(super) fn provider(&self) -> &'static str {
+        self.towers.provider().name()
+    }
+
     /// Unit embeddings of texts.
     pub(super) fn texts(&self, texts: &[String]) -> Result<Vec<Vec<f32>>> {
         Ok(self.towers.embed_texts(texts)?.into_iter().map(|text| text.row).collect())
@@ -107,6 +115,32 @@ impl<'a> Tools<'a> {
             maps: meaning.photos,
             meaning: meaning.report,
         })
+    }
+
+    /// Milliseconds of giving the scene of `inputs` its meaning, `runs` times after a first one
+    /// that does not count, ascending.
+    pub(super) fn timed(
+        &self,
+        photos: &[PosedPhoto],
+        inputs: &[usize],
+        way: &Way,
+        runs: usize,
+    ) -> Result<Vec<f64>> {
+        let given: Vec<PosedPhoto> = inputs.iter().map(|&i| photos[i].clone()).collect();
+        let made = make(self.engine, &given, &way.options)?;
+        let (cameras, gaussians) = (&made.cameras, &made.gaussians);
+        let parts = SemanticsInput { photos: &given, cameras, gaussians };
+        let cancel = AtomicBool::new(false);
+        let watch = Watch { progress: &|_, _| (), cancel: &cancel };
+        let once = |_| -> Result<f64> {
+            let begun = Instant::now();
+            understand(self.engine, &parts, &made.report.method, watch)?;
+            Ok(begun.elapsed().as_secs_f64() * 1e3)
+        };
+        let mut times = (0..=runs.max(1)).map(once).collect::<Result<Vec<f64>>>()?;
+        times.remove(0);
+        times.sort_by(f64::total_cmp);
+        Ok(times)
     }
 
     /// Looks at a scene from the target's camera; with `flat` also at its first photo alone.

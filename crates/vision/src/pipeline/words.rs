@@ -79,7 +79,8 @@ pub fn find_words(
 /// has at its pixel.
 ///
 /// The sums are the derivative of a picture by the colours of its Gaussians: of a loss whose
-/// derivative by each pixel is 1, whether the word is there, and its score.
+/// derivative by each pixel is 1, whether the word is there, and its score. What is shown is summed
+/// once for all words.
 ///
 /// # Errors
 /// `cancelled`, `internal`; `limit_exceeded` where a photo shows more Gaussians than a backward
@@ -92,23 +93,67 @@ pub fn lift(
     cancel: &AtomicBool,
 ) -> Result<Vec<Vec<u16>>> {
     let grey = grey(input.gaussians)?;
+    let request = |camera| RenderRequest::plain(camera, Kinds::COLOR, default_near(median_depth));
     let mut gradients = Gradients::default();
-    let mut of_word = |maps: &Vec<IndexMap>| -> Result<Vec<u16>> {
-        let mut sums = vec![[0.0_f64; 3]; grey.len()];
-        for (camera, map) in input.cameras.iter().zip(maps) {
+    // Of each layer the sums at the Gaussians, three layers a pass.
+    let mut summed = |layers: &[Layer<'_>]| -> Result<Vec<Vec<f64>>> {
+        let mut sums = vec![vec![0.0_f64; grey.len()]; layers.len()];
+        for (photo, camera) in input.cameras.iter().enumerate() {
             unless_cancelled(cancel)?;
             let Some(camera) = small(camera) else { continue };
-            let request = RenderRequest::plain(camera, Kinds::COLOR, default_near(median_depth));
-            let by = FrameGradients { color: Some(said(&camera, map)), ..Default::default() };
-            renderer.backward(&grey, &request, &mut |_| Ok(by.clone()), &mut gradients)?;
-            for (sum, of) in sums.iter_mut().zip(&gradients.sh) {
-                sum.iter_mut().zip(of).for_each(|(sum, v)| *sum += f64::from(*v / SH_C0));
+            for (layers, sums) in layers.chunks(3).zip(sums.chunks_mut(3)) {
+                let by =
+                    FrameGradients { color: Some(said(&camera, photo, layers)), ..<_>::default() };
+                let give = &mut |_: &_| Ok(by.clone());
+                renderer.backward(&grey, &request(camera), give, &mut gradients)?;
+                for (channel, sums) in sums.iter_mut().enumerate() {
+                    let of = gradients.sh.iter().map(|of| f64::from(of[channel] / SH_C0));
+                    sums.iter_mut().zip(of).for_each(|(sum, v)| *sum += v);
+                }
             }
         }
-        let own = semantics::from_source(input.gaussians.source(), input.cameras, maps);
-        Ok(sums.iter().zip(own).map(|(sums, own)| score(*sums, own)).collect())
+        Ok(sums)
     };
-    maps.iter().map(&mut of_word).collect()
+    let (mut shown, mut found) = (Vec::new(), Vec::new());
+    // The first word goes with what is shown, further ones are three in two passes.
+    let (first, rest) = maps.split_at(maps.len().min(1));
+    for words in first.chunks(1).chain(rest.chunks(3)) {
+        let with = found.is_empty().then_some(Layer::Shown).into_iter();
+        let layers: Vec<_> =
+            with.chain(words.iter().flat_map(|of| [Layer::There(of), Layer::Score(of)])).collect();
+        let mut sums = summed(&layers)?;
+        if found.is_empty() {
+            shown = sums.remove(0);
+        }
+        for (maps, sums) in words.iter().zip(sums.chunks_exact(2)) {
+            let own = semantics::from_source(input.gaussians.source(), input.cameras, maps);
+            let each = shown.iter().zip(&sums[0]).zip(&sums[1]).zip(own);
+            found.push(each.map(|(((a, b), c), own)| score([*a, *b, *c], own)).collect());
+        }
+    }
+    Ok(found)
+}
+
+/// What is summed of the weights of Gaussians, by what a word has at the cells of each photo.
+#[derive(Clone, Copy, Debug)]
+enum Layer<'a> {
+    /// All weights.
+    Shown,
+    /// Those on the word.
+    There(&'a [IndexMap]),
+    /// The same, times the word's score, 0 to 1.
+    Score(&'a [IndexMap]),
+}
+
+impl Layer<'_> {
+    /// What counts at a place of a photo, shares of its sides.
+    fn at(self, photo: usize, [x, y]: [f64; 2]) -> f32 {
+        match self {
+            Self::Shown => 1.0,
+            Self::There(maps) => f32::from(u8::from(maps[photo].at(x, y) > 0)),
+            Self::Score(maps) => f32::from(maps[photo].at(x, y)) / SURE,
+        }
+    }
 }
 
 /// The Gaussians in one colour, so that none is at the end of the range of colours.
@@ -128,13 +173,13 @@ fn small(camera: &SceneCamera) -> Option<Camera> {
     Some(Camera { intrinsics, ..camera.camera })
 }
 
-/// Of each pixel 1, whether the photo has a word there, and the word's score, 0 to 1.
-fn said(camera: &Camera, map: &IndexMap) -> Vec<[f32; 3]> {
+/// Of each pixel of a photo what up to three layers have there.
+fn said(camera: &Camera, photo: usize, layers: &[Layer<'_>]) -> Vec<[f32; 3]> {
     let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
     let share = |at: u32, of: u32| (f64::from(at) + 0.5) / f64::from(of);
     let pixel = |(x, y)| {
-        let score = map.at(share(x, width), share(y, height));
-        [1.0, f32::from(u8::from(score > 0)), f32::from(score) / SURE]
+        let place = [share(x, width), share(y, height)];
+        [0, 1, 2].map(|c| layers.get(c).map_or(0.0, |layer| layer.at(photo, place)))
     };
     (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(pixel).collect()
 }

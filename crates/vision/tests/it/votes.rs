@@ -100,12 +100,31 @@ fn a_photo_that_sees_something_else_there_has_no_vote() {
     assert!(voted[400..].iter().all(|m| *m == 7), "the screen keeps its own");
 }
 
-fn word(gaussians: &Gaussians, cameras: &[SceneCamera], maps: &[IndexMap]) -> Vec<u16> {
+fn words_of(
+    gaussians: &Gaussians,
+    cameras: &[SceneCamera],
+    maps: &[Vec<IndexMap>],
+) -> Vec<Vec<u16>> {
     let input = SemanticsInput { photos: &[], cameras, gaussians };
     let renderer = CpuRenderer::new(1).unwrap();
-    let maps = [maps.to_vec()];
-    let scores = words::lift(&renderer, &input, 10.0, &maps, &AtomicBool::new(false)).unwrap();
-    scores.into_iter().next().unwrap()
+    words::lift(&renderer, &input, 10.0, maps, &AtomicBool::new(false)).unwrap()
+}
+
+fn word(gaussians: &Gaussians, cameras: &[SceneCamera], maps: &[IndexMap]) -> Vec<u16> {
+    words_of(gaussians, cameras, &[maps.to_vec()]).remove(0)
+}
+
+#[test]
+fn words_of_one_call_are_those_of_a_call_each() {
+    let gaussians = wall(2, |_| 10.0);
+    let maps: Vec<Vec<IndexMap>> = (0..6_u16)
+        .map(|t| vec![map(u32::from(2 * t), 300 + 100 * t), map(u32::from(18 - 3 * t), 950)])
+        .collect();
+    let together = words_of(&gaussians, &cameras(2), &maps);
+    let alone = maps.iter().map(|of| word(&gaussians, &cameras(2), of));
+    assert_eq!(together, alone.collect::<Vec<_>>());
+    assert!((1..6).all(|t| together[t] != together[t - 1]));
+    assert!(words_of(&gaussians, &cameras(2), &[]).is_empty());
 }
 
 #[test]
