@@ -59,6 +59,9 @@ const LEFT_OUT_FACTOR: f64 = 2.0;
 /// A proof that differs so many times as much from the held-out photos as from learnt ones is no
 /// proof: nothing is published (docs/adr/0073).
 const OVERFIT_REFUSED: f64 = 6.0;
+/// Where a proof overfits, scenes of fewer photos lose by steps beyond those of the first part, and
+/// scenes of more photos gain (docs/adr/0101).
+const STEPS_FREE_FROM: usize = 16;
 
 /// The work on a version makes all that was done this many times as long.
 const LONGER: u32 = 4;
@@ -108,8 +111,9 @@ pub struct RefineCalls<'a> {
 /// Where the proof of a further part gains less than [`RefineOptions::gain_min`] in PSNR and SSIM
 /// together ([`Judged::score`]), the work ends: so more time is never worse. It also ends where the
 /// proof overfits, for what its held-out photos gain then, other views lose: with the first
-/// version, of no more steps than the first part has, where that one's proof does so
-/// ([`RefineOptions::overfit_max`]), and before a further one ([`RefineOptions::overfit_further`]).
+/// version where that one's proof does so ([`RefineOptions::overfit_max`]), which has no more steps
+/// than the first part where photos are few, and before a further one
+/// ([`RefineOptions::overfit_further`]).
 ///
 /// The first scene of all photos goes on from the proof's Gaussians, and those of the held-out
 /// photos, where the proof explains these nearly as well as photos that it learnt
@@ -265,7 +269,7 @@ impl Parts<'_, '_> {
                 None => self.begin_whole(&proof, overfits)?,
             };
             let mut budget = self.rest_of(part, proven.time);
-            if overfits {
+            if overfits && self.photos.len() < STEPS_FREE_FROM {
                 let share = 1.0 - self.proof_share();
                 budget.steps = budget.steps.min(share_of(self.options.first_steps, share).max(1));
             }
