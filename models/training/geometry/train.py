@@ -58,6 +58,8 @@ def parse():
     ap.add_argument("--judge-views", type=int, nargs="*", default=VIEWS_JUDGED, help="photos of the sets that are judged")
     ap.add_argument("--warm-up", type=int, default=200, help="steps")
     ap.add_argument("--batch", type=int, default=16, help="pairs a step; fewer sets of more views")
+    ap.add_argument("--eight-bits", nargs="+", metavar="FILE", help="GRAPH RANGES [FIRST]: round as the CPU file does (eight_bits.py)")
+    ap.add_argument("--float-share", type=float, default=0.2, help="share of the steps without these roundings")
     return ap.parse_args()
 
 
@@ -146,6 +148,11 @@ class Trainer:
         if args.init:
             self.net.load_state_dict({k: v.float() for k, v in torch.load(args.init).items()})
         self.ema = {k: v.clone() for k, v in self.net.state_dict().items()}
+        self.rounding = None
+        if args.eight_bits:
+            from eight_bits import EightBits
+
+            self.rounding = EightBits(self.net, *args.eight_bits)
         self.params = list(self.net.parameters())
         matrices, rest = [p for p in self.params if p.ndim > 1], [p for p in self.params if p.ndim <= 1]
         groups = [{"params": matrices, "weight_decay": 0.02}, {"params": rest, "weight_decay": 0.0}]
@@ -173,6 +180,8 @@ class Trainer:
         keep = {k: v.clone() for k, v in self.net.state_dict().items()}
         self.net.load_state_dict(self.ema)
         self.net.eval()
+        if self.rounding:
+            self.rounding.on = True
         by_use, by_scene = self.judge_of.figures(self.net, every)
         if tag in ("start", "final"):
             self.judge_of.sheet(self.net, os.path.join(self.args.out, f"{tag}.jpg"))
@@ -229,6 +238,8 @@ class Trainer:
         lr = args.lr * min(1.0, (self.step + 1) / args.warm_up) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(share, 1))))
         for group in self.opt.param_groups:
             group["lr"] = lr
+        if self.rounding:
+            self.rounding.on = draw.random() >= args.float_share
         with torch.autocast(device.type, dtype=torch.bfloat16):
             out = self.net(images, K[:, :V], c2w[:, :V], near, far, nearest_views(c2w[:, :V], min(V - 1, 3)))
         loss, mse, err = 0.0, None, None
@@ -243,7 +254,7 @@ class Trainer:
             picture, mse = picture_loss(pic, want, args.robust if real else None, args.log_weight)
             loss = 0.25 * loss + picture
         self.update(loss)
-        kind = "real" if real else "made"
+        kind = ("real" if real else "made") + ("q" if self.rounding and self.rounding.on else "")
         if mse is not None:
             self.add(f"{kind}{V}" + ("x2" if zoom == 2 else ""), -10 * math.log10(max(mse.item(), 1e-9)))
         if err is not None:
