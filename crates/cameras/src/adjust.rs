@@ -63,8 +63,9 @@ struct PointPart {
 }
 
 const LENS_PARAMS: usize = 2;
-/// Spreads from which on a lens is thought to be another than was said (Cauchy's loss): EXIF may lie.
-const DOUBT: f64 = 3.0;
+/// Spreads from which on a lens is thought to be another than was said (Cauchy's loss), of its focal
+/// length and of k1: EXIF may lie, and most lenses are plain, but not all.
+const DOUBTS: [f64; 2] = [3.0, 1.0];
 
 impl Bundle {
     /// Cauchy's loss of all sights and the priors.
@@ -88,8 +89,8 @@ impl Bundle {
         let each = self.lenses.iter().zip(&self.priors).map(|(lens, prior)| {
             let focal = (lens.focal / prior.focal).ln() / prior.log_spread;
             let k1 = lens.k1 / prior.k1_spread;
-            let soft = |of: f64| DOUBT * DOUBT * (of / DOUBT).powi(2).ln_1p();
-            soft(focal) + soft(k1)
+            let soft = |of: f64, doubt: f64| doubt * doubt * (of / doubt).powi(2).ln_1p();
+            soft(focal, DOUBTS[0]) + soft(k1, DOUBTS[1])
         });
         s2 * each.sum::<f64>()
     }
@@ -307,7 +308,7 @@ impl Bundle {
             let rest = SVector::<f64, 2>::new((prior.focal / lens.focal).ln(), -lens.k1);
             let spreads = [prior.log_spread, prior.k1_spread];
             let weights: [f64; 2] = std::array::from_fn(|k| {
-                let off = rest[k] / (spreads[k] * DOUBT);
+                let off = rest[k] / (spreads[k] * DOUBTS[k]);
                 s2 / (spreads[k] * spreads[k] * (1.0 + off * off))
             });
             for (k, free) in [options.free_focal, options.free_k1].into_iter().enumerate() {

@@ -402,8 +402,8 @@ impl<'a> Grower<'a> {
             (self.state.points[track], moved[track]) = (Some(point), true);
         }
         // The others go where the cameras say now.
-        for track in 0..self.tracks.len() {
-            if !moved[track] && self.state.points[track].is_some() {
+        for (track, moved) in moved.into_iter().enumerate() {
+            if !moved && self.state.points[track].is_some() {
                 let found = self.point_of(&self.tracks[track]);
                 let none = || vec![false; self.tracks[track].len()];
                 let (point, agrees) = found.map_or((None, none()), |(p, a)| (Some(p), a));

@@ -81,16 +81,13 @@ pub(crate) fn ended(
 /// Where the photos' pixels say that the keypoints of a solution's points are, from the photos'
 /// middles; `None` for keypoints of no point, and where the photos do not agree.
 fn found(survey: &Survey, photos: &[Grey], best: &Candidate) -> Vec<Vec<Option<Vector2<f64>>>> {
-    let tracks: Vec<_> =
-        best.tracks.iter().zip(&best.grown.agrees).zip(&best.grown.points).collect();
-    let of_track =
-        |((track, agrees), point): &((&Vec<Sighting>, &Vec<bool>), &Option<Vector3<f64>>)| {
-            let point = point.as_ref()?;
-            let own =
-                track.iter().zip(agrees.iter()).filter(|(_, agrees)| **agrees).map(|(s, _)| *s);
-            of_point(survey, photos, &best.grown, &own.collect::<Vec<_>>(), point)
-        };
-    let moved: Vec<_> = tracks.par_iter().filter_map(of_track).collect();
+    let of_track = |index: usize| {
+        let (track, agrees) = (&best.tracks[index], &best.grown.agrees[index]);
+        let own = track.iter().zip(agrees).filter(|(_, agrees)| **agrees).map(|(s, _)| *s);
+        let point = best.grown.points[index].as_ref()?;
+        of_point(survey, photos, &best.grown, &own.collect::<Vec<_>>(), point)
+    };
+    let moved: Vec<_> = (0..best.tracks.len()).into_par_iter().filter_map(of_track).collect();
     let mut found: Vec<Vec<Option<Vector2<f64>>>> =
         survey.views.iter().map(|view| vec![None; view.pixels.len()]).collect();
     for ((photo, keypoint), place) in moved.into_iter().flatten() {
@@ -238,8 +235,10 @@ mod tests {
         let (survey, photos, best) = drifting();
         let found = found(&survey, &photos, &best);
         let mut worst = 0.0_f64;
-        for k in 0..99 {
-            let places: Vec<_> = (0..3).filter_map(|i| Some((i, found[i][k]?))).collect();
+        let [one, two, three, _] = &found[..] else { panic!("four photos") };
+        for ((one, two), three) in one.iter().zip(two).zip(three) {
+            let places = [one, two, three].into_iter().enumerate();
+            let places: Vec<_> = places.filter_map(|(i, place)| Some((i, (*place)?))).collect();
             for (photo, place) in &places {
                 let there = wall(places[0].0, &places[0].1);
                 let seen = LENS.project(&pose(*photo).seen(&there)).unwrap();

@@ -36,8 +36,8 @@ pub fn solve(
     progress: &(dyn Fn(f64) + Sync),
 ) -> Result<Solution> {
     check(photos, matches, options)?;
-    let sizes = greys.iter().zip(photos).all(|(grey, photo)| grey.size == photo.size);
-    if !greys.is_empty() && !(sizes && greys.len() == photos.len()) {
+    let sizes = || greys.iter().map(|grey| grey.size).eq(photos.iter().map(|photo| photo.size));
+    if !greys.is_empty() && !sizes() {
         return Err(Error::invalid(format!(
             "greys: {} of other sizes or numbers than the {} photos",
             greys.len(),
