@@ -182,7 +182,7 @@ mod tests {
         center + ray * ((5.0 - center.z) / ray.z)
     }
 
-    /// A wall in four photos, keypoints that drift along with the photo, and the right cameras. The
+    /// A wall in four photos, keypoints that drift from photo to photo, and the right cameras. The
     /// wall of the last photo has other paper.
     fn drifting() -> (Survey, Vec<Grey>, Candidate) {
         let grey = |photo: usize| {
@@ -203,8 +203,10 @@ mod tests {
             lens: 0,
             pixels: points
                 .iter()
-                .map(|p| {
-                    let drift = Vector2::new(0.5 * photo as f64 - 0.5, -0.3 * photo as f64);
+                .enumerate()
+                .map(|(k, p)| {
+                    let drift = Vector2::new(0.4, [0.0, -0.6, 0.6, 0.0][photo]);
+                    let drift = if k % 2 == 0 { drift } else { -drift };
                     LENS.project(&pose(photo).seen(p)).unwrap() + drift
                 })
                 .collect(),
@@ -253,12 +255,16 @@ mod tests {
 
     #[test]
     fn a_sharpened_solution_fits_its_keypoints() {
-        let (survey, photos, best) = drifting();
+        let (survey, photos, mut best) = drifting();
+        // What pixels do not confirm in a photo stays where it has little else: leave that photo out.
+        best.grown.poses[3] = None;
+        best.tracks.iter_mut().for_each(|track| track.truncate(3));
+        best.grown.agrees.iter_mut().for_each(|agrees| agrees.truncate(3));
         let (survey, sharp) = sharpened(&survey, &photos, &best, &AtomicBool::new(false));
         let mut errors = Vec::new();
         for (track, point) in sharp.tracks.iter().zip(&sharp.grown.points) {
             let Some(point) = point else { continue };
-            for (photo, keypoint) in track.iter().filter(|(photo, _)| *photo < 3) {
+            for (photo, keypoint) in track {
                 let pose = sharp.grown.poses[*photo as usize].as_ref().unwrap();
                 let seen = sharp.grown.lenses[0].project(&pose.seen(point)).unwrap();
                 let pixel = survey.views[*photo as usize].pixels[*keypoint as usize];
