@@ -63,6 +63,9 @@ struct PointPart {
 }
 
 const LENS_PARAMS: usize = 2;
+/// Spreads from which on a lens is thought to be another than was said (Cauchy's loss), of its focal
+/// length and of k1: EXIF may lie, and most lenses are plain, but not all.
+const DOUBTS: [f64; 2] = [3.0, 1.0];
 
 impl Bundle {
     /// Cauchy's loss of all sights and the priors.
@@ -86,7 +89,8 @@ impl Bundle {
         let each = self.lenses.iter().zip(&self.priors).map(|(lens, prior)| {
             let focal = (lens.focal / prior.focal).ln() / prior.log_spread;
             let k1 = lens.k1 / prior.k1_spread;
-            focal * focal + k1 * k1
+            let soft = |of: f64, doubt: f64| doubt * doubt * (of / doubt).powi(2).ln_1p();
+            soft(focal, DOUBTS[0]) + soft(k1, DOUBTS[1])
         });
         s2 * each.sum::<f64>()
     }
@@ -301,8 +305,12 @@ impl Bundle {
         let s2 = options.scale_px * options.scale_px;
         for (i, (lens, prior)) in self.lenses.iter().zip(&self.priors).enumerate() {
             let at = lens_at + LENS_PARAMS * i;
-            let weights = [prior.log_spread, prior.k1_spread].map(|s| s2 / (s * s));
             let rest = SVector::<f64, 2>::new((prior.focal / lens.focal).ln(), -lens.k1);
+            let spreads = [prior.log_spread, prior.k1_spread];
+            let weights: [f64; 2] = std::array::from_fn(|k| {
+                let off = rest[k] / (spreads[k] * DOUBTS[k]);
+                s2 / (spreads[k] * spreads[k] * (1.0 + off * off))
+            });
             for (k, free) in [options.free_focal, options.free_k1].into_iter().enumerate() {
                 // A number that is held has only this equation: it stays.
                 let (weight, rest) = if free { (weights[k], rest[k]) } else { (1.0, 0.0) };

@@ -29,6 +29,8 @@ const SURE_INLIERS: usize = 60;
 const BY_LINK_MIN: usize = 5;
 /// Angle between two rays to a point, degrees, under which its depth is not known.
 const ANGLE_MIN_DEG: f64 = 0.5;
+/// Points of a photo that count where it is adjusted: those that most photos see.
+const KEPT: usize = 200;
 /// Cameras from which on the focal length and the radial term move.
 const FREE_FOCAL: usize = 3;
 const FREE_K1: usize = 4;
@@ -336,11 +338,29 @@ impl<'a> Grower<'a> {
         }
     }
 
-    /// The state as a bundle, and the track of each of its points.
+    /// In how many photos a point of each photo must be seen so that [`KEPT`] of them count.
+    fn lengths(&self) -> Vec<usize> {
+        let mut of = vec![Vec::new(); self.state.poses.len()];
+        for (track, agrees) in self.tracks.iter().zip(&self.state.agrees) {
+            let length = agrees.iter().filter(|agrees| **agrees).count();
+            for (sighting, _) in track.iter().zip(agrees).filter(|(_, agrees)| **agrees) {
+                of[sighting.0 as usize].push(length);
+            }
+        }
+        let least = |mut lengths: Vec<usize>| {
+            lengths.sort_unstable_by(|a, b| b.cmp(a));
+            lengths.get(KEPT).copied().unwrap_or(2)
+        };
+        of.into_iter().map(least).collect()
+    }
+
+    /// The state as a bundle, and the track of each of its points. Of each photo only the points
+    /// that most others see count: those that few see carry the drift of keypoints.
     fn bundle(&self) -> (Bundle, Vec<usize>) {
         let mut tracks = Vec::new();
         let mut points = Vec::new();
         let mut sights = Vec::new();
+        let lengths = self.lengths();
         for (index, point) in self.state.points.iter().enumerate() {
             let Some(point) = point else { continue };
             let of_track = self.tracks[index].iter().zip(&self.state.agrees[index]);
@@ -348,7 +368,7 @@ impl<'a> Grower<'a> {
                 .filter(|(_, agrees)| **agrees)
                 .map(|(s, _)| Sight { camera: s.0 as usize, pixel: self.pixel(*s) })
                 .collect();
-            if own.len() >= 2 {
+            if own.len() >= 2 && own.iter().any(|sight| own.len() >= lengths[sight.camera]) {
                 tracks.push(index);
                 points.push(*point);
                 sights.push(own);
@@ -377,8 +397,18 @@ impl<'a> Grower<'a> {
             }
         }
         self.state.lenses = bundle.lenses;
+        let mut moved = vec![false; self.tracks.len()];
         for (track, point) in tracks.into_iter().zip(bundle.points) {
-            self.state.points[track] = Some(point);
+            (self.state.points[track], moved[track]) = (Some(point), true);
+        }
+        // The others go where the cameras say now.
+        for (track, moved) in moved.into_iter().enumerate() {
+            if !moved && self.state.points[track].is_some() {
+                let found = self.point_of(&self.tracks[track]);
+                let none = || vec![false; self.tracks[track].len()];
+                let (point, agrees) = found.map_or((None, none()), |(p, a)| (Some(p), a));
+                (self.state.points[track], self.state.agrees[track]) = (point, agrees);
+            }
         }
         cost
     }

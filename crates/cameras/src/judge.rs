@@ -32,6 +32,8 @@ const TWO_PLACED_FOCAL_KNOWN: f64 = 0.7;
 const AGREEING_MIN: f64 = 0.75;
 pub(crate) const EXPLAINED_MIN: f64 = 0.8;
 pub(crate) const RIVAL_MAX: f64 = 0.95;
+/// Rivals from which on it is asked whether they end at the same cameras.
+const RIVAL_SEEN: f64 = 0.9;
 pub(crate) const MIRRORED_MAX: f64 = 0.92;
 pub(crate) const MISSING_MAX: f64 = 0.55;
 pub(crate) const LOOPS_MIN: f64 = 0.5;
@@ -109,24 +111,41 @@ pub(crate) fn confidence(evidence: &Evidence) -> f64 {
         * rising(-evidence.missing, -MISSING_MAX, 0.03)
 }
 
-/// The score of the best solution that differs, over the photos that `best` places, as a share of
-/// that of `best`.
-pub(crate) fn rival(survey: &Survey, best: &Candidate, others: &[Candidate]) -> f64 {
-    let of = |other: &Candidate| {
+/// Solutions that differ, each with its score over the photos that `best` places, as a share of that
+/// of `best`; the best first.
+pub(crate) fn rivals<'a>(
+    survey: &Survey,
+    best: &Candidate,
+    others: &'a [Candidate],
+) -> Vec<(f64, &'a Candidate)> {
+    let of = |other: &'a Candidate| {
         let mut grown = other.grown.clone();
         for (pose, own) in grown.poses.iter_mut().zip(&best.grown.poses) {
             *pose = pose.filter(|_| own.is_some());
         }
-        score_of(survey, &grown) / best.score.max(1.0)
+        (score_of(survey, &grown) / best.score.max(1.0), other)
     };
-    let differs = |other: &&Candidate| {
-        difference_deg(&best.grown, &other.grown).is_some_and(|angle| angle > DIFFERENT_DEG)
-    };
-    others.iter().filter(differs).map(of).fold(0.0, f64::max)
+    let mut all: Vec<_> = others.iter().filter(|other| differ(best, other)).map(of).collect();
+    all.sort_by(|a, b| b.0.total_cmp(&a.0));
+    all
+}
+
+/// Whether two solutions say different cameras.
+pub(crate) fn differ(a: &Candidate, b: &Candidate) -> bool {
+    difference_deg(&a.grown, &b.grown).is_some_and(|angle| angle > DIFFERENT_DEG)
+}
+
+/// The share of the strongest rival that is one. Those that cost no confidence are not asked.
+pub(crate) fn strongest(
+    rivals: Vec<(f64, &Candidate)>,
+    is_one: impl Fn(&Candidate) -> bool,
+) -> f64 {
+    let first = rivals.into_iter().find(|(share, other)| *share < RIVAL_SEEN || is_one(other));
+    first.map_or(0.0, |(share, _)| share)
 }
 
 /// The evidence for a solution; `relinked` are the links under its lenses, `rival` is that of
-/// [`rival`].
+/// [`strongest`].
 pub(crate) fn evidence(
     survey: &Survey,
     best: &Candidate,

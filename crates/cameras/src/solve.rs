@@ -2,11 +2,16 @@
 
 use std::sync::atomic::AtomicBool;
 
-use segsplat_core::{error::Result, scene::unless_cancelled};
+use segsplat_core::{
+    error::{Error, Result},
+    scene::unless_cancelled,
+};
 
 use crate::{
     given::{PairMatches, PhotoKeypoints, SolveOptions, check},
-    joints, judge, report,
+    joints, judge,
+    patch::Grey,
+    report, sharpen,
     solution::{Evidence, Placing, Solution},
     solver, world,
 };
@@ -14,7 +19,8 @@ use crate::{
 /// Finds the cameras of photos.
 ///
 /// `matches` has each pair of photos at most once, in any order; pairs that were tried and did not
-/// match are given with few or no pairs of keypoints: they are evidence too. `progress` gets shares
+/// match are given with few or no pairs of keypoints: they are evidence too. `greys` are the photos
+/// themselves, or none: with them keypoints are moved to where pixels agree. `progress` gets shares
 /// of the work, 0..1.
 ///
 /// # Errors
@@ -24,11 +30,20 @@ use crate::{
 pub fn solve(
     photos: &[PhotoKeypoints],
     matches: &[PairMatches],
+    greys: &[Grey],
     options: &SolveOptions,
     cancel: &AtomicBool,
     progress: &(dyn Fn(f64) + Sync),
 ) -> Result<Solution> {
     check(photos, matches, options)?;
+    let sizes = || greys.iter().map(|grey| grey.size).eq(photos.iter().map(|photo| photo.size));
+    if !greys.is_empty() && !sizes() {
+        return Err(Error::invalid(format!(
+            "greys: {} of other sizes or numbers than the {} photos",
+            greys.len(),
+            photos.len()
+        )));
+    }
     let survey = solver::survey(photos, matches, options);
     unless_cancelled(cancel)?;
     progress(0.05);
@@ -46,10 +61,21 @@ pub fn solve(
     };
     let others: Vec<solver::Candidate> = candidates.collect();
     // As they were grown: what is finished explains more than what is not.
-    let rival = judge::rival(&survey, &best, &others);
+    let rivals = judge::rivals(&survey, &best, &others);
     solver::finish(&survey, &mut best, cancel);
     let (links, dropped) = joints::drop_weak(&survey, &mut best, cancel);
+    let with_pixels = !greys.is_empty();
+    let (seen, sharp) = match with_pixels {
+        true => sharpen::sharpened(&survey, greys, &best, cancel),
+        false => (survey.clone(), best.clone()),
+    };
+    // What ends at the same cameras is no other solution.
+    let is_other = |other: &solver::Candidate| {
+        !with_pixels || judge::differ(&sharp, &sharpen::ended(&survey, greys, other, cancel))
+    };
+    let rival = judge::strongest(rivals, is_other);
     let evidence = judge::evidence(&survey, &best, &links, rival);
+    let (survey, best) = (seen, sharp);
     let why_not = |photo| report::why_left_out(&survey, photo, &dropped);
     let (placings, points) = world::outcome(photos, &survey, &best, why_not)?;
     let confidence = judge::confidence(&evidence);

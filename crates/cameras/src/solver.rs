@@ -24,7 +24,7 @@ const FOCALS: [f64; 10] = [0.45, 0.55, 0.65, 0.75, 0.87, 1.0, 1.2, 1.45, 1.8, 2.
 const FOCAL_USUAL: f64 = 0.8;
 const FOCAL_USUAL_SPREAD: f64 = 0.5;
 const FOCAL_EXIF_SPREAD: f64 = 0.03;
-const K1_SPREAD: f64 = 0.1;
+const K1_SPREAD: f64 = 0.03;
 /// First pairs that are tried for each focal length, and for more than [`PHOTOS_MANY`] photos.
 const SEEDS: usize = 4;
 const SEEDS_OF_MANY: usize = 2;
@@ -38,6 +38,7 @@ const FINISH_GAIN: f64 = 1.01;
 const KEPT_SHARE: f64 = 0.95;
 
 /// A solution and what it was made from.
+#[derive(Clone)]
 pub(crate) struct Candidate {
     pub(crate) grown: Grown,
     pub(crate) links: Vec<Link>,

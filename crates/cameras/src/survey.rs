@@ -19,7 +19,7 @@ const AGREE_SHARE: f64 = 0.003;
 const AS_GOOD: f64 = 0.85;
 
 /// A photo as the solver sees it.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct View {
     pub(crate) lens: usize,
     /// Keypoints, pixels from the middle.
@@ -32,14 +32,14 @@ pub(crate) struct View {
 }
 
 /// A pair of photos and its matches, the most trusted first.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Pair {
     pub(crate) photos: [usize; 2],
     pub(crate) matches: Vec<[u32; 2]>,
 }
 
 /// All that was given.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Survey {
     pub(crate) views: Vec<View>,
     pub(crate) pairs: Vec<Pair>,

@@ -14,8 +14,8 @@ use std::{
 
 use rayon::prelude::*;
 use segsplat_cameras::{
-    CONFIDENCE_MIN, Evidence, PairMatches, PhotoKeypoints, Placed, Placing, Solution, SolveOptions,
-    mend, pairs_to_match, solve,
+    CONFIDENCE_MIN, Evidence, Grey, PairMatches, PhotoKeypoints, Placed, Placing, Solution,
+    SolveOptions, mend, pairs_to_match, solve,
 };
 
 use super::{
@@ -199,8 +199,11 @@ fn solved(pipeline: &Pipeline, photos: &[UnposedPhoto], watch: Watch<'_>) -> Res
         keypoints_max: pipeline.features()?.manifest().count,
         ..SolveOptions::default()
     };
+    let grey =
+        |(photo, _): &(&Photo, Option<f64>)| Grey::new(photo.width, photo.height, &photo.rgb);
+    let greys: Vec<Grey> = pipeline.workers.install(|| pixels.par_iter().map(grey).collect());
     let share = |done: f64| tell(MATCHES_END + (SOLVED_END - MATCHES_END) * done as f32);
-    pipeline.workers.install(|| solve(&keypoints, &matches, &options, cancel, &share))
+    pipeline.workers.install(|| solve(&keypoints, &matches, &greys, &options, cancel, &share))
 }
 
 /// Keypoints of photos, each with its focal length where that is known, and their matches.
