@@ -307,7 +307,7 @@ class Drawing {
     });
     this.fill(this.photos, gl.RGBA32F, 2, rowsOf.length / 8, gl.FLOAT, rowsOf);
     this.ask([], 0);
-    this.worker.postMessage({ count });
+    this.worker.postMessage({ count, coarse: header.coarse });
     return count;
   }
 

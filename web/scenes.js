@@ -222,7 +222,7 @@ function forget() {
   showKept();
 }
 
-// Loads the Gaussians, the largest first, and shows them as they come.
+// Loads the scene, the coarsest form or the largest Gaussians first, and shows it as it comes.
 async function load(id, camera, isCompared = false) {
   loading?.abort();
   state.filming?.abort();
@@ -359,11 +359,12 @@ async function takeChanged(id) {
   return true;
 }
 
-// How many Gaussians there are, and which of them where the device has no room for all.
+// How many Gaussians there are, and which of them where there is no room for all.
 function shown() {
   const all = state.scene.gaussians;
-  if (drawing.count === all) return t('gaussians', { n: count(all) });
-  return t('gaussians.some', { n: count(drawing.count), all: count(all) });
+  if (drawing.count === recordsOf(state.scene)) return t('gaussians', { n: count(all) });
+  const some = state.scene.coarse.length ? 'gaussians.coarse' : 'gaussians.some';
+  return t(some, { n: count(drawing.count), all: count(all) });
 }
 
 // What the report of a scene says, and what refinement gained.

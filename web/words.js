@@ -202,6 +202,11 @@ const TABLE = {
     'Die {n} größten von {all} Gauß-Splats: für mehr ist hier kein Platz',
     '{all} 个高斯中最大的 {n} 个：此设备容不下更多',
   ],
+  'gaussians.coarse': [
+    '{all} Gaussians, some of them merged: there is room for {n} here',
+    '{all} Gauß-Splats, zum Teil zusammengefasst: hier ist Platz für {n}',
+    '{all} 个高斯，其中一部分合并显示：此处最多容纳 {n} 个',
+  ],
   ahead: ['waiting, {n} ahead', 'wartet, {n} davor', '等待中，前面还有 {n} 个'],
   left: ['about {time} left', 'noch etwa {time}', '约剩 {time}'],
   seconds: ['{n} s', '{n} s', '{n} 秒'],

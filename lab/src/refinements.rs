@@ -36,6 +36,7 @@ pub(crate) struct Variant {
     mends_from: f64,
     proof_share: f32,
     overfit_max: f32,
+    overfit_further: f32,
     device_bytes_max: u64,
     /// Factors on learning rates: on all, and on single ones.
     rate: f32,
@@ -69,6 +70,7 @@ impl Default for Variant {
             mends_from: plain.mends_from,
             proof_share: plain.proof_share,
             overfit_max: plain.overfit_max,
+            overfit_further: plain.overfit_further,
             device_bytes_max: plain.device_bytes_max,
             rate: 1.0,
             means: 1.0,
@@ -124,6 +126,7 @@ impl Variant {
             mends_from: self.mends_from,
             proof_share: self.proof_share,
             overfit_max: self.overfit_max,
+            overfit_further: self.overfit_further,
             device_bytes_max: self.device_bytes_max,
             ..plain
         }

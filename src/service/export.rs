@@ -14,6 +14,7 @@ use tokio::{
 
 use super::{
     access::SceneAccess,
+    coarse::{LastCoarse, forms},
     features,
     page::write_page,
     query,
@@ -99,8 +100,15 @@ impl Service {
         let scene = blocking(move || inner.load(&access)).await??;
         let etag = etag(&semantics_tag(&scene));
         let near = default_near(scene.meta.report.median_depth);
-        let work_bytes = order_bytes(&scene.gaussians);
-        let write = move |to: &mut dyn Write| write_packed(&scene, near, to);
+        let work_bytes = LastCoarse::bytes(&scene.gaussians);
+        let inner = Arc::clone(&self.inner);
+        let write = move |to: &mut dyn Write| {
+            let Some(coarse) = inner.coarse.of(&scene)? else {
+                return write_packed(&scene, near, None, to);
+            };
+            let entries = coarse.entries(&scene.gaussians);
+            write_packed(&scene, near, Some(forms(&coarse, &entries)), to)
+        };
         Ok(Export::streamed(etag, write).placed(&self.inner, work_bytes, None))
     }
 

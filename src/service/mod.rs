@@ -4,6 +4,7 @@
 
 mod access;
 mod camera;
+mod coarse;
 mod create;
 mod edits;
 mod encode;

@@ -129,7 +129,7 @@ pub(super) fn write_page(
     put(&texts.replace('<', "\\u003c"))?;
     put(r#"</script><script type="application/octet-stream" id="packed">"#)?;
     let mut coded = EncoderWriter::new(&mut *to, &BASE64_STANDARD);
-    write_packed(scene, default_near(scene.meta.report.median_depth), &mut coded)?;
+    write_packed(scene, default_near(scene.meta.report.median_depth), None, &mut coded)?;
     coded.finish().map_err(unwritten)?;
     drop(coded);
     to.write_all(b"</script>").and_then(|()| to.write_all(end.as_bytes())).map_err(unwritten)

@@ -5,6 +5,7 @@ use std::{fmt, sync::Arc};
 use tokio::sync::{Semaphore, watch};
 
 use super::{
+    coarse::LastCoarse,
     edits::Edits,
     memory::{Memory, Share},
     schedule::Scheduler,
@@ -75,6 +76,8 @@ pub(super) struct Shared {
     pub(super) inferences: Arc<Semaphore>,
     pub(super) key_locks: [tokio::sync::Mutex<()>; KEY_LOCKS],
     pub(super) memory: Memory,
+    /// Of the scene whose packed form was read last.
+    pub(super) coarse: LastCoarse,
     /// Whether callers who wait for what is being made are answered at once.
     pub(super) stopping: watch::Sender<bool>,
 }
@@ -151,6 +154,7 @@ impl Service {
             inferences: Arc::new(Semaphore::new(config.limits.inferences_max)),
             key_locks: Default::default(),
             memory: Memory::new(config.limits.memory_bytes_max),
+            coarse: LastCoarse::default(),
             stopping: watch::Sender::default(),
             limits,
             config,

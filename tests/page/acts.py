@@ -67,8 +67,13 @@ def post(url: str, parts: list[tuple[str, str, bytes]]) -> str:
 
 
 def pixels(page: Page) -> np.ndarray:
-    """The canvas, `[H, W, 3]`."""
+    """The canvas once all is drawn, `[H, W, 3]`."""
     settled(page)
+    return pixels_now(page)
+
+
+def pixels_now(page: Page) -> np.ndarray:
+    """The canvas, `[H, W, 3]`."""
     coded = page.evaluate("segsplat.pixels()").split(",")[1]
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(coded))).convert("RGB"))
 

@@ -2,7 +2,7 @@
 
     make eval-scenes
     PYTHONPATH=clients/python/src SEGSPLAT_BIN=target/release/segsplat \\
-        python tests/tools/distances.py target/eval/scenes/scene_*
+        python tests/tools/distances.py --photos 8 --refine 20000 target/eval/scenes/scene_*
 
 The rooms are in metres and their floor is y = 0, so a pixel of the floor has an exact place. Their
 cameras are sent in units of 0.27 m. Points of the floor are picked in each photo; the length
@@ -13,10 +13,10 @@ Of the ground: how many degrees its normal is off, and its height at its middle.
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import json
 import shutil
-import sys
 import tempfile
 from pathlib import Path
 
@@ -25,13 +25,17 @@ from PIL import Image
 
 import segsplat
 
-PHOTOS, GRID, UNIT, SHORT = 4, 5, 0.27, 0.5
+GRID, UNIT, SHORT = 5, 0.27, 0.5
 
 
-def made(client: segsplat.Client, folder: Path) -> tuple[segsplat.Scene, list[dict], dict]:
-    """A scene of every third photo in units of UNIT, and its frames in metres."""
+def made(
+    client: segsplat.Client, folder: Path, photos: int, refine: int
+) -> tuple[segsplat.Scene, list[dict], dict]:
+    """A scene of photos spread over the room in units of UNIT, refined for some milliseconds, and
+    its frames in metres."""
     told = json.loads((folder / "transforms.json").read_text())
-    frames = told["frames"][: 3 * PHOTOS : 3]
+    every = len(told["frames"]) // photos
+    frames = told["frames"][: every * photos : every]
     sent = []
     with tempfile.TemporaryDirectory() as scratch:
         to = Path(scratch)
@@ -44,6 +48,9 @@ def made(client: segsplat.Client, folder: Path) -> tuple[segsplat.Scene, list[di
             sent.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
         (to / "transforms.json").write_text(json.dumps({**told, "frames": sent}))
         scene = client.scene(to, semantics="off", progress=False)
+    if refine:
+        scene.refine(refine)
+        list(scene.events())
     return scene, frames, told
 
 
@@ -68,11 +75,16 @@ def floor_points(scene: segsplat.Scene, folder: Path, frames: list[dict], told: 
     return np.array(found)
 
 
-def main(folders: list[Path]) -> None:
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("--photos", type=int, default=4)
+    parser.add_argument("--refine", type=int, default=0, help="milliseconds")
+    given = parser.parse_args()
     everything = []
     with segsplat.local(flags=["--renderer", "cpu"], env={"SEGSPLAT_REFINE": "off"}) as client:
-        for folder in folders:
-            scene, frames, told = made(client, folder)
+        for folder in given.folders:
+            scene, frames, told = made(client, folder, given.photos, given.refine)
             points = floor_points(scene, folder, frames, told)
             if len(points) < 4:
                 print(f"{folder.name}: {len(points)} points of the floor are too few", flush=True)
@@ -102,4 +114,4 @@ def main(folders: list[Path]) -> None:
 
 
 if __name__ == "__main__":
-    main([Path(one) for one in sys.argv[1:]])
+    main()

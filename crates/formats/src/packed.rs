@@ -1,5 +1,6 @@
 //! A scene as the page draws it: 32 bytes a Gaussian, those that cover most first, so that the
-//! start of the file is already a picture.
+//! start of the file is already a picture. A large scene begins with coarser forms of itself, and
+//! then has the order that these give it.
 //!
 //! Little-endian: the length of the JSON header in bytes (u32); the header, filled with blanks to a
 //! multiple of four bytes; the cells of the backdrop, `[64, 128, 3]` u8; then for each Gaussian
@@ -8,6 +9,12 @@
 //! rotation, the photo it comes from, and its entry of the bank. The rotation (w x y z, unit) is
 //! its three smallest numbers, each from -√½ to √½ in 32,767 steps; the number left out, which is
 //! positive, is the top bit of the first plus twice that of the second.
+//!
+//! `coarse` of the header lists the coarser forms, which come first, the coarsest before the
+//! others: each is the whole scene in `gaussians` records, in place of all that follows it. The
+//! members of its records lie in the next form (after the last one: in the scene's own Gaussians)
+//! in the same order. `ends[k]` is where those of its first `2048 (k + 1)` records end there. So who
+//! has read up to there draws these members in place of the records.
 //!
 //! Colours are those of degree 0: a scene of a higher degree loses its shine.
 
@@ -24,6 +31,21 @@ use crate::{
 const LN_SCALE: [f32; 2] = [-16.0, 4.0];
 /// Gaussians packed before they are written.
 const PART: usize = 8192;
+/// Records of a coarser form that are replaced together: a row of the page's texture.
+const ROW: usize = 2048;
+
+/// Coarser forms of a scene.
+#[derive(Clone, Copy, Debug)]
+pub struct CoarseForms<'a> {
+    /// Those of one form after the other, the coarsest form first.
+    pub gaussians: &'a Gaussians,
+    /// Their entries of the bank.
+    pub entries: &'a [u16],
+    /// Of each form and each of its Gaussians, where its members in the next form end.
+    pub ends: &'a [Vec<u32>],
+    /// The scene's own Gaussians in the order of the finest form.
+    pub order: &'a [u32],
+}
 
 /// What the page must know besides the Gaussians.
 #[derive(Serialize)]
@@ -46,20 +68,41 @@ struct Header<'a> {
     understood: bool,
     cameras: &'a [SceneCamera],
     network_focal_px: &'a [f64],
+    coarse: Vec<FormHeader>,
+}
+
+/// What the header says of a coarser form.
+#[derive(Serialize)]
+struct FormHeader {
+    gaussians: usize,
+    /// Where the members of each [`ROW`] of its records end in the next form.
+    ends: Vec<u32>,
+}
+
+impl FormHeader {
+    fn of(ends: &[u32]) -> Self {
+        let rows = ends.chunks(ROW).filter_map(|row| row.last().copied());
+        Self { gaussians: ends.len(), ends: rows.collect() }
+    }
 }
 
 /// Writes the whole file; `near` is the near plane of its views, world units.
 ///
 /// # Errors
 /// `store_unavailable` where `to` fails.
-pub fn write_packed(scene: &Scene, near: f32, to: &mut dyn Write) -> Result<()> {
+pub fn write_packed(
+    scene: &Scene,
+    near: f32,
+    coarse: Option<CoarseForms<'_>>,
+    to: &mut dyn Write,
+) -> Result<()> {
     let unwritten = |cause| {
         Error::new(ErrorCode::StoreUnavailable, "the scene cannot be written").caused_by(cause)
     };
     let (gaussians, report) = (&scene.gaussians, &scene.meta.report);
     let unit = if report.median_depth > 0.0 { report.median_depth as f32 } else { 1.0 };
     let header = Header {
-        version: 1,
+        version: 2,
         id: &scene.meta.id,
         gaussians: gaussians.len(),
         origin: gaussians.origin().to_array(),
@@ -73,6 +116,7 @@ pub fn write_packed(scene: &Scene, near: f32, to: &mut dyn Write) -> Result<()> 
         understood: scene.semantics.is_some(),
         cameras: &scene.meta.cameras,
         network_focal_px: &report.network_focal_px,
+        coarse: coarse.iter().flat_map(|all| all.ends).map(|ends| FormHeader::of(ends)).collect(),
     };
     let mut header = serde_json::to_vec(&header)
         .map_err(|e| Error::internal("the scene has no header").caused_by(e))?;
@@ -81,12 +125,24 @@ pub fn write_packed(scene: &Scene, near: f32, to: &mut dyn Write) -> Result<()> 
     to.write_all(&length.to_le_bytes()).map_err(unwritten)?;
     to.write_all(&header).map_err(unwritten)?;
     to.write_all(scene.backdrop.cells().as_flattened()).map_err(unwritten)?;
-    for part in largest_first(gaussians).chunks(PART) {
-        let words: Vec<u32> = part.iter().flat_map(|&i| packed(gaussians, i, unit)).collect();
-        let bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
-        to.write_all(&bytes).map_err(unwritten)?;
-    }
-    Ok(())
+    let entries = gaussians.semantic_index();
+    let mut put = |mut order: &mut dyn Iterator<Item = usize>, of: (&Gaussians, &[u16])| {
+        let mut bytes = Vec::with_capacity(PART * size_of::<[u32; 8]>());
+        loop {
+            let part = (&mut order).take(PART);
+            bytes.extend(part.flat_map(|i| packed(of, i, unit)).flat_map(u32::to_le_bytes));
+            if bytes.is_empty() {
+                return Ok(());
+            }
+            to.write_all(&bytes).map_err(unwritten)?;
+            bytes.clear();
+        }
+    };
+    let Some(coarse) = coarse else {
+        return put(&mut largest_first(gaussians).into_iter(), (gaussians, entries));
+    };
+    put(&mut (0..coarse.gaussians.len()), (coarse.gaussians, coarse.entries))?;
+    put(&mut coarse.order.iter().map(|&i| i as usize), (gaussians, entries))
 }
 
 /// All Gaussians by what they cover: opacity times the product of the two larger scales.
@@ -105,7 +161,7 @@ fn steps(value: f32, most: u16) -> u32 {
     (value.clamp(0.0, 1.0) * f32::from(most) + 0.5) as u32
 }
 
-fn packed(gaussians: &Gaussians, i: usize, unit: f32) -> [u32; 8] {
+fn packed((gaussians, entries): (&Gaussians, &[u16]), i: usize, unit: f32) -> [u32; 8] {
     let [x, y, z] = gaussians.means()[i].map(f32::to_bits);
     let [r, g, b] = gaussians.sh()[i * gaussians.sh_count()].map(|c| steps(SH_C0 * c + 0.5, 255));
     let color = r | g << 8 | b << 16 | steps(gaussians.opacities()[i], 255).max(1) << 24;
@@ -114,7 +170,7 @@ fn packed(gaussians: &Gaussians, i: usize, unit: f32) -> [u32; 8] {
     let [s0, s1, s2] = scales.map(|s| steps(s, u16::MAX));
     let [q0, q1, q2] = rotation(gaussians.quats()[i]);
     let photo = u32::from(gaussians.source()[i].view);
-    let entry = u32::from(gaussians.semantic_index()[i]);
+    let entry = u32::from(entries[i]);
     [x, y, z, color, s0 | s1 << 16, s2 | q0 << 16, q1 | q2 << 16, photo | entry << 16]
 }
 

@@ -14,6 +14,7 @@
 pub mod backward;
 pub mod blocks;
 pub mod budget;
+pub mod coarse;
 pub mod compare;
 pub mod constants;
 pub mod cpu;

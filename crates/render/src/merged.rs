@@ -89,8 +89,7 @@ impl Merged {
                 None => (own.semantic_index()[id as usize], own.opacities()[id as usize]),
                 Some(at) => (entries[at], self.sums[at]),
             };
-            let rows: Vec<(u16, f32)> = self.group(at).iter().map(of).collect();
-            let entry = heaviest(&rows);
+            let entry = heaviest(self.group(at).iter().map(of).collect());
             entries.push(entry);
         }
         let entries: Arc<[u16]> = entries.into();
@@ -100,9 +99,10 @@ impl Merged {
 }
 
 /// The entry with the largest sum, the lower one of equals.
-fn heaviest(rows: &[(u16, f32)]) -> u16 {
-    let sum = |entry: u16| rows.iter().filter(|row| row.0 == entry).map(|row| row.1).sum::<f32>();
-    let sums = rows.iter().map(|row| (row.0, sum(row.0)));
+pub(crate) fn heaviest(mut rows: Vec<(u16, f32)>) -> u16 {
+    rows.sort_by_key(|row| row.0);
+    let sums = rows.chunk_by(|a, b| a.0 == b.0);
+    let sums = sums.map(|one| (one[0].0, one.iter().map(|row| row.1).sum::<f32>()));
     let best = sums.max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
     best.map_or(0, |(entry, _)| entry)
 }

@@ -10,6 +10,7 @@
 mod adam;
 mod backward;
 mod blocks;
+mod coarse;
 #[path = "../common/mod.rs"]
 mod common;
 mod compare;

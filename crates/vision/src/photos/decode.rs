@@ -1,5 +1,5 @@
 //! Decodes photos. The header and the limits are checked before the pixels. A JPEG too large to be
-//! decoded whole is decoded at a half or a quarter of its size.
+//! decoded whole, or larger than is asked for, is decoded at a half or a quarter of its size.
 
 use std::io::Cursor;
 
@@ -46,8 +46,19 @@ impl Header {
     }
 
     /// Pixels that are decoded.
-    fn decoded_pixels(&self) -> u64 {
+    pub(super) fn decoded_pixels(&self) -> u64 {
         self.decoded_size().map(u64::from).into_iter().product()
+    }
+
+    /// The same of a photo whose longer side need not be over `side` pixels: decoded at the least
+    /// part of its size that has as many, where that takes less memory than all of it.
+    pub(super) fn at_least(self, side: u32, bytes: &[u8]) -> Self {
+        let longer = self.width.max(self.height);
+        let mut smaller = REDUCTIONS.into_iter().rev().filter(|by| longer / by >= side);
+        match smaller.next().filter(|by| *by > self.reduction && is_reducible(self.format, bytes)) {
+            Some(reduction) => Self { reduction, ..self },
+            None => self,
+        }
     }
 
     /// Pixels that take memory while it is decoded: some 7 bytes each, as coefficients do at most.
@@ -218,6 +229,16 @@ fn picture_of_png(bytes: &[u8]) -> Vec<u8> {
 /// grey and reports no error.
 fn jpeg_ends(bytes: &[u8]) -> bool {
     has_marker(bytes, |marker| marker == 0xD9)
+}
+
+/// Whether fewer pixels take less memory: of a JPEG of one scan, in colours that can be reduced.
+fn is_reducible(format: ImageFormat, bytes: &[u8]) -> bool {
+    if format != ImageFormat::Jpeg || is_progressive(bytes) {
+        return false;
+    }
+    let mut decoder = jpeg_decoder::Decoder::new(bytes);
+    let kind = decoder.read_info().ok().and_then(|()| decoder.info()).map(|it| it.pixel_format);
+    matches!(kind, Some(jpeg_decoder::PixelFormat::L8 | jpeg_decoder::PixelFormat::RGB24))
 }
 
 /// Whether all scans of a JPEG must be there before a pixel is: it has several.
@@ -404,6 +425,35 @@ mod tests {
         for cut in 0..png.len() {
             assert!(png.starts_with(&picture_of_png(&png[..cut])), "{cut}");
         }
+    }
+
+    #[test]
+    fn a_photo_that_may_be_smaller_is_decoded_smaller_where_that_takes_less_memory() {
+        let limits = Limits::default();
+        let rgb = image::RgbImage::from_fn(640, 480, |x, y| image::Rgb([x as u8, y as u8, 90]));
+        let written = |format: ImageFormat| {
+            let mut out = Cursor::new(Vec::new());
+            rgb.write_to(&mut out, format).unwrap();
+            out.into_inner()
+        };
+        let decoded = |bytes: &[u8], side: u32| {
+            let header = header(bytes, "a photo", &limits).unwrap().at_least(side, bytes);
+            let photo = pixels(bytes, &header, Orientation::NoTransforms, "a photo", &limits);
+            let Photo { width, height, rgb, .. } = photo.unwrap();
+            assert_eq!(header.decoded_pixels(), u64::from(width) * u64::from(height));
+            ([width, height], rgb)
+        };
+        let jpeg = written(ImageFormat::Jpeg);
+        let sides = [(640, 640), (321, 640), (320, 320), (161, 320), (160, 160), (16, 160)];
+        for (side, width) in sides {
+            assert_eq!(decoded(&jpeg, side).0, [width, width * 3 / 4], "for {side}");
+        }
+        let [whole, quarter] = [640, 160].map(|side| decoded(&jpeg, side).1);
+        let mean = |rgb: &[u8]| rgb.iter().map(|v| f64::from(*v)).sum::<f64>() / rgb.len() as f64;
+        assert!((mean(&whole) - mean(&quarter)).abs() < 1.0, "the same picture");
+        assert_eq!(decoded(&written(ImageFormat::Png), 16).0, [640, 480], "no other format");
+        let progressive = include_bytes!("../../tests/fixtures/progressive.jpg");
+        assert_eq!(decoded(progressive, 16).0, [64, 48], "all its coefficients are kept anyway");
     }
 
     #[test]

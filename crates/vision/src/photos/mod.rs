@@ -14,7 +14,12 @@ mod turns;
 mod undistort;
 mod unposed;
 
-use std::{collections::BTreeMap, path::Path, sync::atomic::AtomicBool};
+use std::{
+    borrow::Cow,
+    collections::BTreeMap,
+    path::Path,
+    sync::atomic::{AtomicBool, AtomicU64, Ordering},
+};
 
 use image::metadata::Orientation;
 use rayon::prelude::*;
@@ -113,7 +118,8 @@ fn put_mask(masks: &mut BTreeMap<String, Vec<u8>>, mask: Option<FoundMask<'_>>) 
 
 /// Reads the photos of an upload that only the steps of a refinement learn, each with its longer
 /// side at most `side_max`, and hands them on in their order, a few at a time. One whose pixels
-/// cannot be read is left out.
+/// cannot be read is left out. Returns how many pixels were decoded: of a large JPEG fewer than it
+/// has.
 ///
 /// # Errors
 /// As [`read`]; `cancelled`; those of `put`.
@@ -124,21 +130,30 @@ pub fn more(
     limits: &Limits,
     cancel: &AtomicBool,
     mut put: impl FnMut(PosedPhoto) -> Result<()>,
-) -> Result<()> {
+) -> Result<u64> {
     // Those whose cameras are solved have all been seen by networks.
     if find_unposed(upload, mode, limits)?.is_some() {
-        return Ok(());
+        return Ok(0);
     }
     let found = find(upload, limits)?;
     if found.more.is_empty() {
-        return Ok(());
+        return Ok(0);
     }
     let all = AllUndecoded::new(&found, limits, cancel)?;
     let sizes: Vec<u64> = all.more.iter().map(|one| one.header.working_pixels()).collect();
+    let decoded = AtomicU64::new(0);
     for together in decoded_together(&sizes, limits.photo_pixels_max) {
         let some: Vec<_> = together
             .into_par_iter()
-            .map(|i| unless_cancelled(cancel).map(|()| all.more[i].read(side_max, limits)))
+            .map(|i| {
+                unless_cancelled(cancel)?;
+                let one = &all.more[i];
+                Ok(one.found.bytes.read().and_then(|bytes| {
+                    let header = one.header.at_least(side_max, &bytes);
+                    decoded.fetch_add(header.decoded_pixels(), Ordering::Relaxed);
+                    one.decoded(&header, bytes, side_max, limits)
+                }))
+            })
             .collect::<Result<_>>()?;
         for read in some {
             match read {
@@ -147,7 +162,7 @@ pub fn more(
             }
         }
     }
-    Ok(())
+    Ok(decoded.into_inner())
 }
 
 /// The photos of an upload whose cameras are to be solved; `None` where it has cameras that count.
@@ -226,9 +241,19 @@ impl<'f, 'a> Undecoded<'f, 'a> {
     /// The photo with its longer side at most `side_max`, without what its mask leaves out and
     /// without the distortion of its lens; also the shares of its pixels that these two took.
     fn read(&self, side_max: u32, limits: &Limits) -> Result<(PosedPhoto, [f64; 2])> {
+        self.decoded(&self.header, self.found.bytes.read()?, side_max, limits)
+    }
+
+    /// The same of its bytes, decoded as `header` says.
+    fn decoded(
+        &self,
+        header: &Header,
+        bytes: Cow<'_, [u8]>,
+        side_max: u32,
+        limits: &Limits,
+    ) -> Result<(PosedPhoto, [f64; 2])> {
         let (found, lens) = (self.found, &self.lens);
-        let bytes = found.bytes.read()?;
-        let photo = decode::pixels(&bytes, &self.header, self.turn, &self.label, limits)?;
+        let photo = decode::pixels(&bytes, header, self.turn, &self.label, limits)?;
         drop(bytes);
         let before = valid_share(&photo);
         let photo = match &found.mask {

@@ -106,9 +106,10 @@ pub struct RefineCalls<'a> {
 /// ([`RefineOptions::proof_share`]). Where its PSNR on these photos rises over that of what is
 /// served, the scene of all photos is refined in the time of the part that is left, and published.
 /// Where the proof of a further part gains less than [`RefineOptions::gain_min`] in PSNR and SSIM
-/// together ([`Judged::score`]), the work ends: so more time is never worse. It also ends with the
-/// first version where the proof overfits ([`RefineOptions::overfit_max`]): what its held-out
-/// photos gain later, other views lose.
+/// together ([`Judged::score`]), the work ends: so more time is never worse. It also ends where the
+/// proof overfits, for what its held-out photos gain then, other views lose: with the first
+/// version, of no more steps than the first part has, where that one's proof does so
+/// ([`RefineOptions::overfit_max`]), and before a further one ([`RefineOptions::overfit_further`]).
 ///
 /// The first scene of all photos goes on from the proof's Gaussians, and those of the held-out
 /// photos, where the proof explains these nearly as well as photos that it learnt
@@ -185,8 +186,6 @@ struct Whole {
     start: Scene,
     gaussians: Gaussians,
     steps: u32,
-    /// [`Refined::overfit`].
-    overfit: f64,
 }
 
 /// A refinement at work.
@@ -251,19 +250,30 @@ impl Parts<'_, '_> {
                 }
                 continue;
             }
-            let mut made = match whole.take() {
-                Some(whole) => whole,
-                None => self.begin_whole(&proof)?,
+            let overfit = self.overfit(&proof)?;
+            let overfits = whole.is_none() && overfit > f64::from(self.options.overfit_max);
+            found.overfit = found.overfit.or(Some(overfit));
+            let most = match whole.is_some() {
+                true => self.options.overfit_further.into(),
+                false => OVERFIT_REFUSED,
             };
-            found.overfit = Some(made.overfit);
-            if made.overfit > OVERFIT_REFUSED {
+            if overfit > most {
                 break;
             }
-            let options = RefineOptions { budget: self.rest_of(part, proven.time), ..options };
+            let mut made = match whole.take() {
+                Some(whole) => whole,
+                None => self.begin_whole(&proof, overfits)?,
+            };
+            let mut budget = self.rest_of(part, proven.time);
+            if overfits {
+                let share = 1.0 - self.proof_share();
+                budget.steps = budget.steps.min(share_of(self.options.first_steps, share).max(1));
+            }
+            let options = RefineOptions { budget, ..options };
             found.report = self.publish(&mut made, &mut proof, &options)?;
             found.versions += 1;
             // What the held-out photos gain by more says nothing of others then.
-            if made.overfit > f64::from(self.options.overfit_max) {
+            if overfits {
                 break;
             }
             whole = Some(made);
@@ -684,10 +694,9 @@ impl Parts<'_, '_> {
         Ok((start, gaussians))
     }
 
-    /// The scene of all photos, before its first step.
-    fn begin_whole(&mut self, proof: &Proof<'_>) -> Result<Whole> {
-        let (start, gaussians) = self.begin(&self.left_out.clone())?;
-        let gaussians = self.with_cameras(gaussians)?;
+    /// How much the proof differs from the held-out photos, as a multiple of how much it differs
+    /// from the learnt ones beside them.
+    fn overfit(&self, proof: &Proof<'_>) -> Result<f64> {
         let differs = |at: &dyn Fn(usize) -> usize| {
             let is_used = |i: &usize| !self.left_out.contains(i);
             let held = proof.held.iter().filter(|&i| is_used(i) && is_used(&(i - 1)));
@@ -696,9 +705,16 @@ impl Parts<'_, '_> {
             Ok::<_, crate::error::Error>(found.iter().sum::<f64>() / found.len() as f64)
         };
         // The photo before each is learnt.
-        let overfit = differs(&|i| i)? / differs(&|i| i - 1)?;
-        let begun = |gaussians| Whole { start, gaussians, steps: 0, overfit };
-        if overfit > f64::from(self.options.overfit_max) {
+        Ok(differs(&|i| i)? / differs(&|i| i - 1)?)
+    }
+
+    /// The scene of all photos, before its first step; it goes on from a proof that does not
+    /// overfit.
+    fn begin_whole(&mut self, proof: &Proof<'_>, overfits: bool) -> Result<Whole> {
+        let (start, gaussians) = self.begin(&self.left_out.clone())?;
+        let gaussians = self.with_cameras(gaussians)?;
+        let begun = |gaussians| Whole { start, gaussians, steps: 0 };
+        if overfits {
             return Ok(begun(gaussians));
         }
         let of_held = |i: usize| proof.held.contains(&usize::from(gaussians.source()[i].view));
@@ -856,10 +872,11 @@ pub fn spooled(
     ready: &mut dyn FnMut(&mut PosedPhoto) -> Result<()>,
 ) -> Result<PhotoSpool> {
     let (mut spool, never) = (PhotoSpool::new(dir)?, AtomicBool::new(false));
-    photos::more(upload, mode, side, limits, &never, |mut photo| {
+    let decoded = photos::more(upload, mode, side, limits, &never, |mut photo| {
         ready(&mut photo)?;
         spool.push(&photo)
     })?;
+    tracing::debug!(decoded, "pixels of more photos");
     Ok(spool)
 }
 

@@ -67,9 +67,9 @@ const GROWS_EVERY: u32 = 100;
 const GROWS_FROM_STEPS: f32 = 300.0;
 const GROWTH_PHOTOS: usize = 4;
 /// How far numbers move at first, `means` as a share of the median depth. 3DGS takes 30,000 steps
-/// that move less: docs/adr/0041.
+/// that move less: docs/adr/0041, and of means docs/adr/0101.
 const RATES: LearningRates = LearningRates {
-    means: 2e-4,
+    means: 6e-5,
     quats: 5e-3,
     scales: 7.5e-2,
     opacities: 6.25e-2,
@@ -164,6 +164,9 @@ pub struct RefineOptions {
     /// much they differ from learnt ones, for the work to go on from them
     /// ([`crate::pipeline::refinement::refined`]).
     pub overfit_max: f32,
+    /// The same for a further version to be published: what its held-out photos gain by more than
+    /// this, other views lose (docs/adr/0101).
+    pub overfit_further: f32,
     /// Bytes that it may take on a device; what needs more is refined on the processor.
     pub device_bytes_max: u64,
     /// Seed of all that is random.
@@ -193,6 +196,7 @@ impl Default for RefineOptions {
             gain_min: 0.2,
             proof_share: 0.25,
             overfit_max: 1.5,
+            overfit_further: 1.8,
             device_bytes_max: 2 << 30,
             seed: 1,
         }

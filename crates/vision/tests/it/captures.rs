@@ -278,11 +278,22 @@ fn of_too_many_photos_the_best_are_taken_and_named() {
         photo
     };
     let many: Vec<PosedPhoto> = (0..70).map(one).collect();
-    let pngs = vec![pngs[0].clone(); 70];
+    let mut jpeg = std::io::Cursor::new(Vec::new());
+    image::load_from_memory(&pngs[0].bytes)
+        .and_then(|it| it.write_to(&mut jpeg, image::ImageFormat::Jpeg))
+        .unwrap();
+    let jpeg = UploadFile { bytes: jpeg.into_inner(), ..pngs[0].clone() };
     let never = AtomicBool::new(false);
     let limits = Limits { photos_max: 68, ..Limits::default() };
-    for layout in ["transforms", "colmap_bin"] {
-        let archive = Some(zipped(&captures::write(layout, &many, &pngs), ""));
+    // Photos for the steps alone need not be decoded whole: counted, for no clock says it.
+    let (whole, half) = (4 * 48 * 36, 4 * 24 * 18);
+    for (layout, file, pixels) in [
+        ("transforms", &pngs[0], whole),
+        ("colmap_bin", &pngs[0], whole),
+        ("transforms", &jpeg, half),
+    ] {
+        let files = vec![file.clone(); 70];
+        let archive = Some(zipped(&captures::write(layout, &many, &files), ""));
         let upload = Upload { archive, ..Upload::default() };
         let got = photos::read_until(&upload, &limits, &never).unwrap();
         assert_eq!(got.photos.len(), 64, "{layout}");
@@ -303,7 +314,7 @@ fn of_too_many_photos_the_best_are_taken_and_named() {
         all.dedup();
         assert_eq!(all.len(), 70, "{layout}: each photo is in one place");
         let (mut read, auto) = (Vec::new(), CamerasMode::Auto);
-        photos::more(&upload, auto, 24, &limits, &never, |photo| {
+        let decoded = photos::more(&upload, auto, 24, &limits, &never, |photo| {
             let stem = photo.file.trim_end_matches(".png");
             let number: usize = stem[stem.len() - 4..].parse().unwrap();
             let [got, want] = [&photo, &many[number]].map(|it| it.camera.camera_to_world);
@@ -317,6 +328,7 @@ fn of_too_many_photos_the_best_are_taken_and_named() {
         })
         .unwrap();
         assert_eq!(read, for_steps, "{layout}");
+        assert_eq!(decoded, pixels, "{layout}");
     }
 }
 

@@ -347,6 +347,15 @@ fn a_proof_that_overfits_ends_the_work_and_one_without_worth_publishes_nothing()
     let (all, overfit) = versions(&photos, 1.5, 40);
     assert_eq!((all, overfit < 1.5), (3, true), "{overfit}");
     assert_eq!(versions(&photos, 0.9 * overfit as f32, 40), (1, overfit), "the first stays");
+    let steps = |options: RefineOptions| {
+        let found = refined_whole(&cpu(), &photos, &options, &|| ()).found;
+        (found.versions, found.report.steps)
+    };
+    let further = RefineOptions { overfit_further: 0.0, ..steps_of(640, 40) };
+    assert_eq!(steps(further), (1, 30), "no further version of a proof that overfits");
+    // What is left of the budget is not for a scene whose proof overfits.
+    let first = RefineOptions { overfit_max: 0.0, ..steps_of(60, 40) };
+    assert_eq!((steps(steps_of(60, 40)), steps(first)), ((1, 50), (1, 30)));
     // Noise in the held-out photos, that nothing explains.
     let mut random = Random(3);
     for at in held_out(photos.len()) {
