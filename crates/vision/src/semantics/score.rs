@@ -328,9 +328,13 @@ impl Scorer {
     }
 
     /// Rows that a text takes though it is not sure of them, and they touch none of which it is,
-    /// not even over others that it takes.
+    /// not even over others that it takes. The best one here has masks of several photos, where
+    /// the text takes one that has: a speck of one photo mostly is another thing.
     fn apart(&self, leads: &[f64], best: f64) -> Vec<usize> {
         let Some(touching) = &self.touching else { return Vec::new() };
+        let several = |row: &usize| self.views.as_ref().is_some_and(|of| of.of_row[*row].len() > 1);
+        let several = (0..leads.len()).filter(several).map(|row| leads[row]);
+        let best = several.filter(|lead| *lead >= 0.0).reduce(f64::max).unwrap_or(best);
         let mut sure: Vec<bool> =
             leads.iter().map(|lead| *lead >= (SURE_SHARE * best).clamp(0.0, SURE)).collect();
         let mut next: Vec<usize> = (0..sure.len()).filter(|row| sure[*row]).collect();
