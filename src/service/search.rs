@@ -142,13 +142,30 @@ impl Backend {
         let words = if listed { self.networks.rivals()? } else { Arc::default() };
         let scoring = Arc::new(Scoring::new(&method, canon, words)?);
         let bank = &of.semantics.bank;
-        let made = (method, Arc::new(Scorer::new(bank, scoring)?.with_views(&of.semantics.views)?));
+        let views = &of.semantics.views;
+        let mut scorer = Scorer::new(bank, scoring)?.with_views(views)?;
+        if !views.entries.is_empty() {
+            let components = self.components(of, &InstanceOptions::default());
+            scorer = scorer.with_touching(&components.touching_entries());
+        }
+        let made = (method, Arc::new(scorer));
         let rows = bank.len() as u64;
         // Rows with their views, and the products of each two of them.
         let numbers = (bank.rows.len() + of.semantics.views.rows.len()) as u64;
         let bytes = 4 * numbers + 4 * rows * (rows + 1);
         self.scorers.insert(key, made.clone(), bytes);
         Ok(made)
+    }
+
+    /// The connected components of a scene's entries.
+    fn components(&self, of: &SemanticScene, options: &InstanceOptions) -> Arc<Components> {
+        if let Some(known) = self.components.find(&of.tag) {
+            return known;
+        }
+        let scene = &of.scene;
+        let made = Arc::new(Components::new(&scene.gaussians, &scene.meta.cameras, options));
+        self.components.insert(of.tag.clone(), Arc::clone(&made), made.size_bytes());
+        made
     }
 
     /// Scores of texts at the Gaussians of a scene, found in its photos by `find` where they are
@@ -408,14 +425,7 @@ impl SceneTexts {
 
     /// The connected components of the scene's entries.
     pub(super) fn components(&self, options: &InstanceOptions) -> Arc<Components> {
-        let (kept, tag) = (&self.backend.components, self.of.tag.clone());
-        if let Some(known) = kept.find(&tag) {
-            return known;
-        }
-        let scene = &self.of.scene;
-        let made = Arc::new(Components::new(&scene.gaussians, &scene.meta.cameras, options));
-        kept.insert(tag, Arc::clone(&made), made.size_bytes());
-        made
+        self.backend.components(&self.of, options)
     }
 
     /// The Gaussians that any of the texts selects.

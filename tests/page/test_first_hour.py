@@ -222,6 +222,21 @@ def test_the_whole_photo_is_in_the_canvas(page: Page, url: str, scene: str) -> N
     assert fov >= 2 * np.degrees(np.arctan(lens["height"] / 2 / lens["fy"])) - 0.1
 
 
+def test_the_box_of_the_sample_is_the_cardboard_box_and_not_the_picture(
+        url: str, scene: str) -> None:
+    ask = json.dumps({"texts": ["box"]}).encode()
+    with urllib.request.urlopen(f"{url}/v1/scenes/{scene}/query", ask) as answer:
+        [found] = json.load(answer)["results"]
+    assert len(found["parts"]) == 1, [part["center"] for part in found["parts"]]
+    view = f"{url}/v1/scenes/{scene}/view?kind=mask&text=box&from=1&width=320&format=png"
+    with urllib.request.urlopen(view) as answer:
+        marked = np.asarray(Image.open(io.BytesIO(answer.read())).convert("L")) > 127
+    assert marked.shape == (240, 320)
+    # By the photo: the cardboard box, the picture on the wall over it.
+    assert marked[110:160, 115:155].mean() > 0.9
+    assert marked[5:40, 130:200].mean() == 0
+
+
 def test_a_thing_is_selected_by_a_click_without_a_word(page: Page, url: str, scene: str) -> None:
     page.goto(f"{url}/#scene={scene}")
     settled(page)

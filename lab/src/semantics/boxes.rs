@@ -8,13 +8,13 @@
 use std::path::Path;
 
 use glam::DVec3;
-use segsplat_vision::semantics::{Box3, Components, Instance, InstanceOptions, Scorer};
+use segsplat_vision::semantics::{Box3, Instance, InstanceOptions};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::{
     labels::LabelledScene,
-    views::{Made, Tools, Way},
+    views::{Made, Tools, Way, scorer},
 };
 use crate::{
     error::{Error, Result},
@@ -95,14 +95,14 @@ pub(super) fn judge(
 
 /// The parts that a text selects, as a query gives them: the best first.
 fn parts(tools: &Tools<'_>, made: &Made, way: &Way, text: &str) -> Result<Vec<Instance>> {
-    let scorer = Scorer::new(&made.bank, way.scoring.clone())?.with_views(&made.views)?;
+    let touching = made.components.touching_entries();
+    let scorer = scorer(&made.bank, &made.views, &touching, &way.scoring)?;
     let rows = tools.texts(&[text.to_owned()])?;
     let scores = scorer.text(rows.first().map_or(&[], Vec::as_slice))?;
     let rows = u16::try_from(made.bank.len()).unwrap_or(u16::MAX);
     let entries: Vec<u16> = (1..=rows).filter(|m| scores.selects(*m)).collect();
     let (gaussians, options) = (&made.scene.gaussians, InstanceOptions::default());
-    let components = Components::new(gaussians, &made.scene.meta.cameras, &options);
-    let mut parts = components.instances(gaussians, &entries, &options);
+    let mut parts = made.components.instances(gaussians, &entries, &options);
     let score = |part: &Instance| part.score(scores.relevancies());
     parts.sort_by(|a, b| score(b).total_cmp(&score(a)));
     Ok(parts)

@@ -6,7 +6,9 @@ use std::{
     time::Instant,
 };
 
-use segsplat_vision::semantics::{Cutter, Scorer, Scoring, TextScores, add_context, contexts};
+use segsplat_vision::semantics::{
+    Components, Cutter, InstanceOptions, Scorer, Scoring, TextScores, add_context, contexts,
+};
 use serde_json::{Value, json};
 
 use super::{
@@ -51,6 +53,7 @@ pub(super) struct Made {
     pub(super) scene: Scene,
     pub(super) bank: Bank,
     pub(super) views: RowViews,
+    pub(super) components: Components,
     /// Entries of each photo's cells.
     maps: Vec<IndexMap>,
     meaning: SemanticsReport,
@@ -73,6 +76,7 @@ pub(super) struct Seen {
 pub(super) struct BankView {
     bank: Bank,
     views: RowViews,
+    touching: Vec<[u16; 2]>,
     weights: PixelWeights,
 }
 
@@ -106,9 +110,12 @@ impl<'a> Tools<'a> {
         let meaning = understand(self.engine, &parts, &method, watch)?;
         let gaussians = reconstruction.gaussians.with_semantic_index(meaning.index)?;
         let scene = scene_of(Reconstruction { gaussians, ..reconstruction });
+        let (gaussians, cameras) = (&scene.gaussians, &scene.meta.cameras);
+        let components = Components::new(gaussians, cameras, &InstanceOptions::default());
         Ok(Made {
             given,
             method,
+            components,
             scene,
             bank: meaning.bank,
             views: meaning.views,
@@ -145,7 +152,7 @@ impl<'a> Tools<'a> {
 
     /// Looks at a scene from the target's camera; with `flat` also at its first photo alone.
     pub(super) fn see(&self, made: &Made, target: &PosedPhoto, flat: bool) -> Result<Seen> {
-        let Made { given, method, scene, bank, views, maps, meaning } = made;
+        let Made { given, method, scene, maps, meaning, .. } = made;
         let plain = view_request(target.camera, Kinds::COLOR, scene.meta.report.median_depth);
         let request = RenderRequest { labels: Labels::Weights, ..plain };
         let frame = self.renderer.render(&scene.gaussians, &served(scene, request))?;
@@ -159,7 +166,9 @@ impl<'a> Tools<'a> {
             "coverage": weight / weights.pixels().max(1) as f64,
             "warnings": scene.meta.report.warnings.len(),
         });
-        let mut banks = vec![BankView { bank: bank.clone(), views: views.clone(), weights }];
+        let (bank, views) = (made.bank.clone(), made.views.clone());
+        let touching = made.components.touching_entries();
+        let mut banks = vec![BankView { bank, views, touching, weights }];
         if let Some(nearest) = given.first().filter(|_| flat) {
             let cancel = AtomicBool::new(false);
             banks.push(self.flat(nearest, &target.camera, method, &cancel)?);
@@ -217,8 +226,19 @@ impl<'a> Tools<'a> {
             }
         }
         let bank = Bank { dim: manifest.dim, rows };
-        Ok(BankView { bank, views: RowViews::default(), weights })
+        Ok(BankView { bank, views: RowViews::default(), touching: Vec::new(), weights })
     }
+}
+
+/// What scores texts by a bank as the product does: where rows are tracks, by what touches, too.
+pub(super) fn scorer(
+    bank: &Bank,
+    views: &RowViews,
+    touching: &[[u16; 2]],
+    scoring: &Arc<Scoring>,
+) -> Result<Scorer> {
+    let scorer = Scorer::new(bank, Arc::clone(scoring))?.with_views(views)?;
+    Ok(if views.entries.is_empty() { scorer } else { scorer.with_touching(touching) })
 }
 
 impl Seen {
@@ -230,8 +250,8 @@ impl Seen {
         scoring: &Arc<Scoring>,
         texts: &[Vec<f32>],
     ) -> Result<Vec<Value>> {
-        let BankView { bank, views, weights } = &self.banks[0];
-        let scorer = Scorer::new(bank, Arc::clone(scoring))?.with_views(views)?;
+        let view = &self.banks[0];
+        let (scorer, weights) = (view.scorer(scoring)?, &view.weights);
         let scored = |text: &Vec<f32>| -> Result<(TextScores, Vec<bool>)> {
             let scores = scorer.text(text)?;
             let mask = scorer.mask(&scores, weights)?;
@@ -275,12 +295,17 @@ impl BankView {
         self.weights.pixel(pixel).filter_map(row)
     }
 
+    /// What scores texts by its entries, as the product does.
+    fn scorer(&self, scoring: &Arc<Scoring>) -> Result<Scorer> {
+        scorer(&self.bank, &self.views, &self.touching, scoring)
+    }
+
     /// The product's masks, and scores by which texts can be compared at a pixel.
     ///
     /// At one pixel all texts share the feature's length, so the smallest `E . B(q - c)` over the
     /// phrases orders them as their relevancies do.
     pub(super) fn maps(&self, scoring: &Arc<Scoring>, texts: &[Vec<f32>]) -> Result<Vec<TextMap>> {
-        let scorer = Scorer::new(&self.bank, Arc::clone(scoring))?.with_views(&self.views)?;
+        let scorer = self.scorer(scoring)?;
         let of = &self.weights;
         let map = |text: &Vec<f32>| -> Result<TextMap> {
             let scores = scorer.text(text)?;

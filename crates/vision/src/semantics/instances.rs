@@ -264,6 +264,19 @@ impl Components {
         }
     }
 
+    /// Pairs of different entries that touch: each pair once, the smaller entry first.
+    #[must_use]
+    pub fn touching_entries(&self) -> Vec<[u16; 2]> {
+        let entries = |pair: &[u32; 2]| {
+            let [a, b] = pair.map(|component| self.entry[component as usize]);
+            [a.min(b), a.max(b)]
+        };
+        let mut pairs: Vec<[u16; 2]> = self.touching.iter().map(entries).collect();
+        pairs.sort_unstable();
+        pairs.dedup();
+        pairs
+    }
+
     /// Bytes in memory.
     #[must_use]
     pub fn size_bytes(&self) -> u64 {

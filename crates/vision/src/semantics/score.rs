@@ -29,6 +29,10 @@ const LEFT_OUT: f64 = -0.05;
 /// Rows with this cosine look alike: two photographs of things of one name have 0.5 (median), two
 /// things of one photograph 0.35. docs/adr/0074-tracks.md
 const ALIKE: f64 = 0.65;
+/// Share of the best entry's difference of cosines, and difference of cosines, under which an entry
+/// is not sure: another thing across the room mostly is not. docs/adr/0103-false-parts.md
+const SURE_SHARE: f64 = 0.7;
+const SURE: f64 = 0.06;
 /// Pixels of a task.
 const PIXELS_EACH: usize = 4096;
 
@@ -260,6 +264,8 @@ pub struct Scorer {
     phrases: Vec<Vec<f64>>,
     /// The masks that rows stand for; `None`: the rows are all there is.
     views: Option<Views>,
+    /// `[M]` rows that touch each one in space; `None`: it is not known, or does not count.
+    touching: Option<Vec<Vec<usize>>>,
     /// Lower triangle of B B^T, row by row. The first call of [`Self::norms`] computes it.
     gram: OnceLock<Vec<f64>>,
 }
@@ -281,7 +287,8 @@ impl Scorer {
         let bank = Bank { dim, rows };
         let norms: Arc<[f64]> = bank.rows.chunks_exact(dim).map(norm).collect();
         let phrases = phrases(&bank, &norms, &scoring);
-        Ok(Self { bank, scoring, norms, phrases, views: None, gram: OnceLock::new() })
+        let (views, touching, gram) = (None, None, OnceLock::new());
+        Ok(Self { bank, scoring, norms, phrases, views, touching, gram })
     }
 
     /// The same, where a row stands for masks of several photos.
@@ -301,6 +308,44 @@ impl Scorer {
             self.phrases = vec![vec![0.0; self.rows()]];
         }
         Ok(self)
+    }
+
+    /// The same, where pairs of entries touch in space: what a text takes must touch what it is
+    /// sure of. A method that leaves out nothing by the best entry leaves out nothing here.
+    #[must_use]
+    pub fn with_touching(mut self, pairs: &[[u16; 2]]) -> Self {
+        let mut touching = vec![Vec::new(); self.rows()];
+        for pair in pairs.iter().map(|pair| pair.map(usize::from)) {
+            for [entry, other] in [pair, [pair[1], pair[0]]] {
+                if entry.min(other) > 0 && entry.max(other) <= self.rows() {
+                    touching[entry - 1].push(other - 1);
+                }
+            }
+        }
+        let counts = self.scoring.near_best < ScoringMethod::NEAR_BEST_MAX;
+        self.touching = counts.then_some(touching);
+        self
+    }
+
+    /// Rows that a text takes though it is not sure of them, and they touch none of which it is,
+    /// not even over others that it takes. The best one here has masks of several photos, where
+    /// the text takes one that has: a speck of one photo mostly is another thing.
+    fn apart(&self, leads: &[f64], best: f64) -> Vec<usize> {
+        let Some(touching) = &self.touching else { return Vec::new() };
+        let several = |row: &usize| self.views.as_ref().is_some_and(|of| of.of_row[*row].len() > 1);
+        let several = (0..leads.len()).filter(several).map(|row| leads[row]);
+        let best = several.filter(|lead| *lead >= 0.0).reduce(f64::max).unwrap_or(best);
+        let mut sure: Vec<bool> =
+            leads.iter().map(|lead| *lead >= (SURE_SHARE * best).clamp(0.0, SURE)).collect();
+        let mut next: Vec<usize> = (0..sure.len()).filter(|row| sure[*row]).collect();
+        while let Some(row) = next.pop() {
+            for &other in &touching[row] {
+                if leads[other] >= 0.0 && !std::mem::replace(&mut sure[other], true) {
+                    next.push(other);
+                }
+            }
+        }
+        (0..sure.len()).filter(|row| leads[*row] >= 0.0 && !sure[*row]).collect()
     }
 
     /// How it scores.
@@ -375,6 +420,10 @@ impl Scorer {
                 *lead = LEFT_OUT;
                 text.leave_out(row);
             }
+        }
+        for row in self.apart(&leads, best) {
+            leads[row] = LEFT_OUT;
+            text.leave_out(row);
         }
         if self.views.is_some() {
             text.keep_edges(best);

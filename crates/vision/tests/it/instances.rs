@@ -80,7 +80,11 @@ fn one_surface_seen_by_two_photos_is_one_part() {
 fn near_and_far_things_are_joined_alike_and_a_step_in_depth_parts() {
     let sites = [patch(0, 0..20, 0..20, 0.5), patch(0, 20..40, 0..20, 50.0)].concat();
     let scene = gaussians(&sites);
-    let found = instances(&scene, &cameras(1), &InstanceOptions::default());
+    let options = InstanceOptions::default();
+    let found = instances(&scene, &cameras(1), &options);
+    let index = (0..800).map(|i| 1 + i / 400).collect();
+    let two = scene.with_semantic_index(index).unwrap();
+    assert!(Components::new(&two, &cameras(1), &options).touching_entries().is_empty());
     assert_eq!(found.len(), 2, "neighbouring pixels, far apart in depth");
     assert!(found.iter().all(|instance| instance.gaussians.len() == 400));
 }
@@ -110,6 +114,7 @@ fn parts_of_some_entries_are_those_of_their_gaussians_alone() {
     let scene = gaussians(&sites).with_semantic_index(index.clone()).unwrap();
     let options = InstanceOptions { count_min: 1, share_min: 0.0, ..InstanceOptions::default() };
     let components = Components::new(&scene, &cameras(2), &options);
+    assert_eq!(components.touching_entries(), [[1, 2], [1, 3], [2, 3]]);
     for entries in [&[1][..], &[2], &[3], &[1, 2], &[1, 3], &[2, 3], &[1, 2, 3]] {
         let chosen = |i: &usize| entries.contains(&index[*i]);
         let alone: Vec<usize> = (0..sites.len()).filter(chosen).collect();

@@ -384,6 +384,75 @@ fn rows_that_look_alike_are_judged_together_and_others_are_not() {
 }
 
 #[test]
+fn what_a_text_takes_touches_what_it_is_sure_of() {
+    // Over the canon by 0.17, 0.16, 0.05, 0.02 and 0.09.
+    let bank = Bank { dim: 2, rows: [38.0, 38.5, 43.0, 44.2, 41.5].map(at).concat() };
+    let taken = |near_best: f64, pairs: &[[u16; 2]]| {
+        let method = ScoringMethod::of(Preset::Default, vec!["y".to_owned()], 10.0, 0.05, 0.0, 1.0);
+        let method = ScoringMethod { near_best, ..method };
+        let scoring = Scoring::new(&method, vec![Y.to_vec()], Arc::default()).unwrap();
+        let scorer = Scorer::new(&bank, scoring.into()).unwrap().with_touching(pairs);
+        let text = scorer.text(&X).unwrap();
+        let pixels = view(&[&[(1, 0.9)], &[(2, 0.9)], &[(3, 0.9)], &[(4, 0.9)], &[(5, 0.9)]]);
+        let entries = [1, 2, 3, 4, 5].map(|m| text.selects(m));
+        assert_eq!(scorer.mask(&text, &pixels).unwrap(), entries);
+        let over = text.relevancies()[1..].iter().map(|v| *v >= 0.5);
+        assert_eq!(over.collect::<Vec<_>>(), entries);
+        entries
+    };
+    // The second is nearly as sure as the first, the last is sure; others must touch one of these.
+    let sure = [true, true, false, false, true];
+    assert_eq!(taken(1.0, &[]), sure);
+    assert_eq!(taken(1.0, &[[3, 4]]), sure);
+    assert_eq!(taken(1.0, &[[2, 3]]), [true, true, true, false, true]);
+    assert_eq!(taken(1.0, &[[5, 4]]), [true, true, false, true, true]);
+    assert_eq!(taken(1.0, &[[4, 3], [1, 4]]), [true; 5], "over others that are taken");
+    // What is too far from the best one is no bridge.
+    assert_eq!(taken(0.14, &[[4, 3], [1, 4]]), sure);
+    assert_eq!(taken(2.0, &[]), [true; 5], "a method that leaves out nothing");
+    assert_eq!(taken(1.0, &[[0, 1], [3, 9]]), sure, "no entries");
+    // Where the best one is unsure too, what is nearly as sure stays.
+    let bank = Bank { dim: 2, rows: [43.0, 43.2, 44.2].map(at).concat() };
+    let scorer = Scorer::new(&bank, scoring(Preset::Default, &[Y])).unwrap().with_touching(&[]);
+    let text = scorer.text(&X).unwrap();
+    assert_eq!([1, 2, 3].map(|m| text.selects(m)), [true, true, false]);
+}
+
+#[test]
+fn what_one_photo_shows_is_no_measure_for_what_several_show() {
+    // Rows that do not look alike: each has an axis of its own. `of`: leads, and masks of each.
+    let taken = |of: [(f32, usize); 4]| {
+        let row = |(i, (lead, masks)): (usize, (f32, usize))| {
+            let mut row = [0.3 + lead, 0.3, 0.0, 0.0, 0.0, 0.0];
+            row[2 + i] = (1.0 - row[0] * row[0] - row[1] * row[1]).sqrt();
+            vec![row; masks]
+        };
+        let masks: Vec<Vec<[f32; 6]>> = of.into_iter().enumerate().map(row).collect();
+        let bank = Bank { dim: 6, rows: masks.iter().flat_map(|of| of[0]).collect() };
+        let views = RowViews {
+            entries: (1..).zip(&masks).flat_map(|(m, of)| vec![m; of.len()]).collect(),
+            rows: masks.concat().concat(),
+        };
+        let method = ScoringMethod::of(Preset::Default, vec!["y".to_owned()], 10.0, 0.05, 0.0, 1.0);
+        let method = ScoringMethod { near_best: 1.0, ..method };
+        let [x, y] = [0, 1].map(|at| (0..6).map(|i| f32::from(u8::from(i == at))).collect());
+        let (x, y): (Vec<f32>, Vec<f32>) = (x, y);
+        let scoring = Scoring::new(&method, vec![y], Arc::default()).unwrap();
+        let scorer = Scorer::new(&bank, scoring.into()).unwrap().with_views(&views).unwrap();
+        let text = scorer.with_touching(&[]).text(&x).unwrap();
+        [1, 2, 3, 4].map(|m| text.selects(m))
+    };
+    // The best of several photos is the second one: it is sure, and so is what is nearly as sure.
+    assert_eq!(taken([(0.17, 1), (0.037, 2), (0.035, 1), (0.01, 2)]), [true, true, true, false]);
+    assert_eq!(taken([(0.17, 2), (0.037, 2), (0.035, 1), (0.01, 2)]), [true, false, false, false]);
+    // Where the text takes nothing of several photos, the best one is the measure.
+    assert_eq!(taken([(0.17, 1), (0.037, 1), (0.035, 1), (0.01, 1)]), [true, false, false, false]);
+    assert_eq!(taken([(0.17, 1), (0.037, 1), (0.035, 1), (-0.01, 2)]), [true, false, false, false]);
+    // What is sure in itself needs no other: 0.06.
+    assert_eq!(taken([(0.17, 1), (0.3, 2), (0.07, 1), (0.05, 1)]), [true, true, true, false]);
+}
+
+#[test]
 fn views_of_another_bank_are_refused() {
     let bank = Bank { dim: 2, rows: X.to_vec() };
     for (entries, rows) in [(vec![2], X.to_vec()), (vec![0], X.to_vec()), (vec![1], vec![1.0])] {
