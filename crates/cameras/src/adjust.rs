@@ -63,8 +63,8 @@ struct PointPart {
 }
 
 const LENS_PARAMS: usize = 2;
-/// Spreads from which on a lens is thought to be another than was said (Cauchy's loss), of its focal
-/// length and of k1: EXIF may lie, and most lenses are plain, but not all.
+/// Spreads from which on a lens is thought to be another than was said (Cauchy's loss), of its
+/// focal length and of k1: EXIF may lie, and most lenses are plain, but not all.
 const DOUBTS: [f64; 2] = [3.0, 1.0];
 
 impl Bundle {

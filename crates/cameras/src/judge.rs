@@ -111,8 +111,8 @@ pub(crate) fn confidence(evidence: &Evidence) -> f64 {
         * rising(-evidence.missing, -MISSING_MAX, 0.03)
 }
 
-/// Solutions that differ, each with its score over the photos that `best` places, as a share of that
-/// of `best`; the best first.
+/// Solutions that differ, each with its score over the photos that `best` places, as a share of
+/// that of `best`; the best first.
 pub(crate) fn rivals<'a>(
     survey: &Survey,
     best: &Candidate,

@@ -2,8 +2,8 @@
 //! points, and a confidence that says whether they can be trusted.
 //!
 //! Pixels are those of `segsplat_core`: the centre of the top left pixel is (0.5, 0.5). Cameras are
-//! OpenCV camera-to-world. Nothing here runs a network; grey photos, where they are given, say where
-//! the keypoints really are.
+//! OpenCV camera-to-world. Nothing here runs a network; grey photos, where they are given, say
+//! where the keypoints really are.
 
 mod absolute;
 mod adjust;

@@ -256,7 +256,7 @@ mod tests {
     #[test]
     fn a_sharpened_solution_fits_its_keypoints() {
         let (survey, photos, mut best) = drifting();
-        // What pixels do not confirm in a photo stays where it has little else: leave that photo out.
+        // What pixels do not confirm in a photo stays where it has little else: leave it out.
         best.grown.poses[3] = None;
         best.tracks.iter_mut().for_each(|track| track.truncate(3));
         best.grown.agrees.iter_mut().for_each(|agrees| agrees.truncate(3));

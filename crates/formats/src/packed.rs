@@ -13,8 +13,8 @@
 //! `coarse` of the header lists the coarser forms, which come first, the coarsest before the
 //! others: each is the whole scene in `gaussians` records, in place of all that follows it. The
 //! members of its records lie in the next form (after the last one: in the scene's own Gaussians)
-//! in the same order. `ends[k]` is where those of its first `2048 (k + 1)` records end there. So who
-//! has read up to there draws these members in place of the records.
+//! in the same order. `ends[k]` is where those of its first `2048 (k + 1)` records end there. So
+//! who has read up to there draws these members in place of the records.
 //!
 //! Colours are those of degree 0: a scene of a higher degree loses its shine.
 
