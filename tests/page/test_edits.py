@@ -111,8 +111,8 @@ def test_what_is_clicked_is_recoloured_and_deleted_by_a_key(
 
 
 def test_a_thing_goes_where_its_outline_was(room: Page, url: str, scene: str) -> None:
-    find(room, "box")
-    room.get_by_role("button", name="Edit box").click()
+    find(room, "table")
+    room.get_by_role("button", name="Edit table").click()
     parts = room.locator("#act-part")
     expect(parts, "a word of several parts is needed here").to_be_visible(timeout=5000)
     parts.select_option("0")
@@ -121,9 +121,9 @@ def test_a_thing_goes_where_its_outline_was(room: Page, url: str, scene: str) ->
     camera = Camera(room)
     room.fill("#move-up", "0.5")
     room.locator("#move-form button[value=copy]").click()
-    edited(room, "Copied: box 1")
+    edited(room, "Copied: table 1")
     one = kept(url, scene)["edits"][0]  # type: ignore[index]
-    assert (one["op"], one["select"]) == ("copy", {"text": "box", "parts": [0]})
+    assert (one["op"], one["select"]) == ("copy", {"text": "table", "parts": [0]})
     way = np.array(one["translation"])
     np.testing.assert_allclose(np.linalg.norm(way), 0.5)
     assert way @ camera.up > 0.4, "up is not up"
