@@ -14,7 +14,7 @@ use crate::{
     render::{Kinds, Renderer, cpu::CpuRenderer, plan::served, train::unit},
     rows::{Rows, median, ms},
     scene::{Camera, CameraToWorld, Density, PosedPhoto, Scene, SceneOptions},
-    scenes::{is_posed, make, scene_of, squares, use_of, view_request},
+    scenes::{SIDE, is_posed, make, scene_of, squares, use_of, view_request},
     setup::Inputs,
     triples::{Triple, triples},
 };
@@ -30,7 +30,7 @@ pub(crate) fn run(inputs: &Inputs, rows: &mut Rows) -> Result<()> {
     let engine = Pipeline::open(&inputs.setup.networks(1))?;
     let renderer = CpuRenderer::new(inputs.setup.threads())?;
     for (name, dir) in inputs.find(is_posed)? {
-        let squares = squares(&dir)?;
+        let squares = squares(&dir, SIDE)?;
         let all = triples(&squares);
         let Some(triple) = all.get(all.len() / 2) else { continue };
         let mut row = compare(&engine, &renderer, &squares, triple, inputs.photos)?;

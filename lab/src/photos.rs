@@ -43,6 +43,9 @@ pub(crate) struct Args {
     /// Most triples of a scene, spread evenly [default: all]
     #[arg(long)]
     most: Option<usize>,
+    /// Side of the square photos, pixels: views are as large
+    #[arg(long, default_value_t = SIDE)]
+    side: u32,
     /// How scenes are made and drawn: default, or paper
     #[arg(long, value_parser = named::<Preset>, default_value = "default")]
     preset: Preset,
@@ -77,7 +80,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let method = (photos, &options, refinement.as_ref());
     let mut scenes = Vec::new();
     for (name, dir) in args.inputs.find(is_posed)? {
-        let squares = squares(&dir)?;
+        let squares = squares(&dir, args.side)?;
         let all = triples(&squares);
         let count = args.most.map_or(all.len(), |most| most.min(all.len()));
         let chosen: Vec<Triple> = (0..count).map(|k| all[k * all.len() / count]).collect();
@@ -151,7 +154,7 @@ fn judge(
     let mut row = json!({
         "target": target.file,
         "psnr": psnr(&color, &truth, valid),
-        "ssim": ssim(&color, &truth, SIDE as usize, valid),
+        "ssim": ssim(&color, &truth, target.photo.width as usize, valid),
         "warp_psnr": hindsight_warp(target, &pair, triple.baseline),
         "gaussians": report.gaussians,
         "geometry_ms": geometry.map(|stage| stage.ms).sum::<f64>(),
@@ -177,7 +180,7 @@ fn judge(
     }
     let mut pictures: grid::Row = given.iter().map(|posed| grid::photo(&posed.photo)).collect();
     pictures.push(grid::photo(&target.photo));
-    pictures.push(grid::color(&color, SIDE));
-    pictures.push(grid::depth(&frame.depth.unwrap_or_default(), SIDE));
+    pictures.push(grid::color(&color, target.photo.width));
+    pictures.push(grid::depth(&frame.depth.unwrap_or_default(), target.photo.width));
     Ok((row, pictures))
 }

@@ -23,7 +23,7 @@ use crate::{
     },
 };
 
-/// Side of the square photos that are compared, pixels.
+/// Side of the square photos that are compared, pixels, where none is asked for: the network's.
 pub(crate) const SIDE: u32 = 256;
 /// What scenes are used for. No constant is chosen on the scenes that are reported.
 const USES: [&str; 2] = ["reported", "chooses"];
@@ -52,17 +52,17 @@ pub(crate) fn is_posed(dir: &Path) -> bool {
     dir.join("transforms.json").is_file()
 }
 
-/// The photos of a scene folder, undistorted, cropped in the middle to their short side, [`SIDE`]
+/// The photos of a scene folder, undistorted, cropped in the middle to their short side, `side`
 /// pixels square.
-pub(crate) fn squares(dir: &Path) -> Result<Vec<PosedPhoto>> {
+pub(crate) fn squares(dir: &Path, side: u32) -> Result<Vec<PosedPhoto>> {
     let photos = photo_files::read_dir(dir, &Limits::default())?;
     let square = |posed: &PosedPhoto| {
-        let fitted = fit(&posed.photo, &posed.camera, [SIDE, SIDE], ResizeFilter::Triangle);
+        let fitted = fit(&posed.photo, &posed.camera, [side, side], ResizeFilter::Triangle);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0..255")]
         let rgb = fitted.rgb.iter().map(|v| (v * 255.0).round() as u8).collect();
         PosedPhoto {
             file: posed.file.clone(),
-            photo: Photo { width: SIDE, height: SIDE, rgb, valid: fitted.valid },
+            photo: Photo { width: side, height: side, rgb, valid: fitted.valid },
             camera: fitted.camera,
             intrinsics_made_for: None,
         }

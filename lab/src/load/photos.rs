@@ -8,7 +8,7 @@ use serde_json::json;
 use crate::{
     error::{Error, Result},
     scene::{Camera, Upload, UploadCameras, UploadFile},
-    scenes::{nearest, squares},
+    scenes::{SIDE, nearest, squares},
 };
 
 /// How far the cameras of one upload are from those of the next, world units: a server may know an
@@ -25,7 +25,7 @@ pub(super) struct Photos {
 
 impl Photos {
     pub(super) fn read(dir: &Path) -> Result<Self> {
-        let photos = squares(dir)?;
+        let photos = squares(dir, SIDE)?;
         let file = |(i, posed): (usize, &crate::scene::PosedPhoto)| {
             let mut bytes = std::io::Cursor::new(Vec::new());
             let (width, height) = (posed.photo.width, posed.photo.height);
