@@ -37,7 +37,8 @@ fn unpacked(zip: &[u8]) -> Files {
         let mut file = zip.by_index(at).expect("a file");
         let mut bytes = Vec::new();
         file.read_to_end(&mut bytes).expect("whole");
-        files.insert(file.name().to_owned(), bytes);
+        let name = file.name().expect("a name").into_owned();
+        files.insert(name, bytes);
     }
     files
 }

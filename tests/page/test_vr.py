@@ -151,7 +151,7 @@ def test_both_eyes_are_drawn_from_where_the_headset_is(page: Page, url: str, spl
             off = float(np.abs(picture - want).mean())
             print(f"{name} at {place}: {off:.2f} levels off, spread {want.std():.1f}")
             assert want.std() > 15, "the eye sees nothing"
-            assert off < 1.5, f"{name} at {place} is {off} levels off"
+            assert off < 0.5, f"{name} at {place} is {off} levels off"
         seen.append(got)
         # Each eye from its own place.
         assert np.abs(got[0] - got[1]).mean() > 3
