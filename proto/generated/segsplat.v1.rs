@@ -2258,8 +2258,8 @@ pub enum ExportFormat {
     Coco = 13,
     /// The same as a JSON with polygons for `LabelMe` beside each photo.
     Labelme = 14,
-    /// Streamed SOG, the levels of detail of `PlayCanvas`, in a zip: `lod-meta.json` and SOG bundles by
-    /// place and level, which a program loads as it looks at them.
+    /// Streamed SOG, the levels of detail of `PlayCanvas`, in a zip: `lod-meta.json` and SOG bundles
+    /// by place and level, which a program loads as it looks at them.
     SogLod = 15,
 }
 impl ExportFormat {
