@@ -89,8 +89,8 @@ formats! {
     /// The page with the scene in it, as one file for a disk. It shows the texts of `text`, one a
     /// line, and needs no server.
     Html = 4: "html", "one HTML file", "html", OCTETS, true, Page;
-    /// Streamed SOG, the levels of detail of `PlayCanvas`, in a zip: `lod-meta.json` and SOG bundles
-    /// by place and level, which a program loads as it looks at them.
+    /// Streamed SOG, the levels of detail of `PlayCanvas`, in a zip: `lod-meta.json` and SOG
+    /// bundles by place and level, which a program loads as it looks at them.
     SogLod = 15: "sog_lod", "streamed SOG (zip)", "sog.zip", ZIP, false, Streamed;
     /// A folder as COLMAP has it, in a zip: photos, cameras, points and depth maps.
     Colmap = 11: "colmap", "COLMAP (zip)", "colmap.zip", ZIP, false,

@@ -4,8 +4,8 @@
 //! Level 0 is the scene, and each further one a coarser form of it ([`CoarseForms`]); a scene
 //! without forms has the one level. `lod-meta.json` has a tree of boxes by place. A leaf has of
 //! each level the Gaussians that stand for the same part of the scene: `lods` says in which file,
-//! from which one on, and how many. `bound` is the box of their ellipsoids of one standard deviation.
-//! What a program looks at from near it takes in level 0, the rest in others.
+//! from which one on, and how many. `bound` is the box of their ellipsoids of one standard
+//! deviation. What a program looks at from near it takes in level 0, the rest in others.
 
 use std::{collections::BTreeMap, io::Write, ops::Range};
 
