@@ -111,6 +111,8 @@ judge-tools: venv
 judge: judge-containers judge-folders judge-inference judge-published judge-splats judge-three judge-compose
 
 judge-splats: judge-tools
+	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check \
+		-r tests/page/requirements.txt
 	$(CLIENT)/venv/bin/python tests/tools/judge_splats.py $(PROGRAM) $(CLIENT)/venv/bin/node \
 		$(JUDGE)/node_modules/@playcanvas/splat-transform/bin/cli.mjs \
 		tests/fixtures/splats/source.ply

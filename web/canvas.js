@@ -13,7 +13,7 @@ function invalidate() {
 
 function frame() {
   // A device that is lost, or came back without its scene, shows nothing and is not settled.
-  if (!drawing?.header || drawing.lost || !state.camera || state.filming) return;
+  if (!drawing?.header || drawing.lost || !state.camera || state.filming || state.vr) return;
   const box = $('stage').getBoundingClientRect(),
     dense = Math.min(devicePixelRatio, 2);
   const moving = performance.now() - state.moving < 250;

@@ -125,11 +125,12 @@ const SHOW = `#version 300 es
 precision highp float; precision highp sampler2D;
 uniform sampler2D blended, first, second, backdrop;
 uniform mat3 turn; uniform vec4 lens; uniform vec2 size; uniform int kind, words;
-uniform vec4 margins; uniform float floorOf; uniform vec3 colors[4], fog; uniform bool sky;
+uniform ivec2 corner; uniform vec4 margins; uniform float floorOf;
+uniform vec3 colors[4], fog; uniform bool sky;
 out vec4 shown;
 void main() {
-  ivec2 cell = ivec2(gl_FragCoord.xy);
-  vec2 place = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
+  ivec2 cell = ivec2(gl_FragCoord.xy) - corner;
+  vec2 place = vec2(cell.x, int(size.y) - 1 - cell.y) + .5;
   vec4 sum = texelFetch(blended, cell, 0);
   vec4 more = texelFetch(second, cell, 0), scores = vec4(texelFetch(first, cell, 0).xyz, more.z);
   vec3 behind = vec3(0.);
@@ -440,8 +441,9 @@ class Drawing {
     this.draw(camera, kind);
   }
 
-  // One frame from a camera. kind: 0 colour, 1 depth, 2 alpha, 3 mask.
-  draw(camera, kind) {
+  // One frame from a camera. kind: 0 colour, 1 depth, 2 alpha, 3 mask. `to` is where it goes in
+  // place of the canvas: a frame, its corner there, and a lens that need not look ahead.
+  draw(camera, kind, to = {}) {
     const gl = this.gl,
       header = this.header,
       [width, height] = this.size;
@@ -452,7 +454,8 @@ class Drawing {
     const more = kind === 1 || this.words.length > 0;
     const { program, at } = more ? this.full : this.plain;
     const turn = [x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]];
-    const lens = [focal, focal, width / 2, height / 2];
+    const lens = to.lens || [focal, focal, width / 2, height / 2],
+      corner = to.at || [0, 0];
     const bind = (texture, k, place) => {
       gl.activeTexture(gl.TEXTURE0 + k);
       gl.bindTexture(gl.TEXTURE_2D, texture);
@@ -490,7 +493,8 @@ class Drawing {
     gl.uniform2f(at.size, width, height);
     // Not instances: software draws each one by itself.
     gl.drawArrays(gl.TRIANGLES, 0, 6 * this.drawn);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, to.frame || null);
+    gl.viewport(...corner, width, height);
     gl.disable(gl.BLEND);
     const show = this.show.at;
     gl.useProgram(this.show.program);
@@ -501,6 +505,7 @@ class Drawing {
     gl.uniformMatrix3fv(show.turn, false, turn);
     gl.uniform4fv(show.lens, lens);
     gl.uniform2f(show.size, width, height);
+    gl.uniform2iv(show.corner, corner);
     gl.uniform1i(show.kind, kind);
     gl.uniform1i(show.words, this.words.length);
     gl.uniform1f(show.floorOf, this.floor);

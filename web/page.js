@@ -41,6 +41,7 @@ function bindTools() {
     e.preventDefault();
     if (state.camera && !state.filming) makeAndKeepFilm().catch(failed);
   };
+  offerVr();
   $('film-stop').onclick = () => state.filming?.abort();
   $('export').onchange = ready(() => {
     const { value: format, dataset } = $('export').selectedOptions[0];

@@ -45,6 +45,7 @@ const state = {
   ground: false,
   upright: null,
   filming: null,
+  vr: null,
 };
 let drawing = null;
 

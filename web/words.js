@@ -456,6 +456,17 @@ const TABLE = {
   ],
   'share.link': ['The link: {link}', 'Der Link: {link}', '链接：{link}'],
   picture: ['Picture', 'Bild', '图片'],
+  vr: ['VR', 'VR', 'VR'],
+  'vr.title': [
+    'Show the scene in a headset',
+    'Die Szene in einem Headset zeigen',
+    '在头戴设备中显示场景',
+  ],
+  'vr.failed': [
+    'The headset shows nothing: {why}',
+    'Das Headset zeigt nichts: {why}',
+    '头戴设备无法显示：{why}',
+  ],
   film: ['Video', 'Video', '视频'],
   'film.motion': ['Motion', 'Bewegung', '运动'],
   'film.turn': ['once around', 'einmal herum', '环绕一周'],

@@ -2258,6 +2258,9 @@ pub enum ExportFormat {
     Coco = 13,
     /// The same as a JSON with polygons for `LabelMe` beside each photo.
     Labelme = 14,
+    /// Streamed SOG, the levels of detail of `PlayCanvas`, in a zip: `lod-meta.json` and SOG bundles
+    /// by place and level, which a program loads as it looks at them.
+    SogLod = 15,
 }
 impl ExportFormat {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -2281,6 +2284,7 @@ impl ExportFormat {
             Self::Nerfstudio => "EXPORT_FORMAT_NERFSTUDIO",
             Self::Coco => "EXPORT_FORMAT_COCO",
             Self::Labelme => "EXPORT_FORMAT_LABELME",
+            Self::SogLod => "EXPORT_FORMAT_SOG_LOD",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -2301,6 +2305,7 @@ impl ExportFormat {
             "EXPORT_FORMAT_NERFSTUDIO" => Some(Self::Nerfstudio),
             "EXPORT_FORMAT_COCO" => Some(Self::Coco),
             "EXPORT_FORMAT_LABELME" => Some(Self::Labelme),
+            "EXPORT_FORMAT_SOG_LOD" => Some(Self::SogLod),
             _ => None,
         }
     }

@@ -1,8 +1,9 @@
 //! `segsplat export`: the Gaussians of a scene as a file for other programs, or of such a file as
 //! another; or the scene as a zip of a folder with photos, cameras and depth, or masks of texts.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
+use fs_err::File;
 use serde_json::json;
 
 use super::{engine, output::Output, reconstruct, scene_file};
@@ -16,7 +17,7 @@ use crate::{
     },
     names::named,
     scene::Preset,
-    service::{FolderSpec, ScoringOptions, scene_splats},
+    service::{FolderSpec, ScoringOptions, scene_levels, scene_splats},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -48,6 +49,10 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         Some((format, FormatKind::Folder(write))) => {
             return folder(args, format, write, config, out);
         }
+        Some((format, FormatKind::Streamed)) => {
+            has_no_photos(args, format.name)?;
+            return levels(args, config, out);
+        }
         Some((_, FormatKind::Splats(splats))) => splats,
         _ => {
             let (gaussians, folders) = endings();
@@ -56,18 +61,24 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
             return Err(Error::invalid(format!("{path}: {why}")));
         }
     };
-    if args.photos.is_some() || !args.texts.is_empty() {
-        let name = splats.name;
-        let why = format!("--photos and --text go with folders, not with {name}");
-        return Err(Error::invalid(why));
-    }
+    has_no_photos(args, splats.name)?;
     gaussians(args, splats, config, out)
+}
+
+/// Refuses what is said of a folder.
+fn has_no_photos(args: &Args, name: &str) -> Result<()> {
+    if args.photos.is_none() && args.texts.is_empty() {
+        return Ok(());
+    }
+    let why = format!("--photos and --text go with folders, not with {name}");
+    Err(Error::invalid(why))
 }
 
 /// Endings of files of Gaussians, and of folders.
 fn endings() -> (String, String) {
     let of = |some: fn(&ExportFormat) -> bool| ExportFormat::listed(some, |row| row.ending);
-    (of(|of| of.is_splats()), of(|of| matches!(of.kind, FormatKind::Folder(_))))
+    let zips = |of: &ExportFormat| matches!(of.kind, FormatKind::Folder(_) | FormatKind::Streamed);
+    (of(|of| of.is_splats()), of(zips))
 }
 
 fn output_help() -> String {
@@ -106,16 +117,9 @@ fn folder(
     let mode = scene.meta.provenance.options.cameras;
     let upload = photos.map(|path| reconstruct::upload(path, mode, config)).transpose()?;
     let service = engine::offline(config, format.lines)?;
-    let unwritable = |e| scene_file::unwritable(&args.output, e);
-    // Half a zip is of no use, and what was there before stays until there is a whole one.
-    let part = args.output.with_added_extension("part");
-    let mut file = fs_err::File::create(&part).map_err(unwritable)?;
     let (texts, preset, scoring) = (&args.texts[..], args.preset, &args.scoring);
     let spec = FolderSpec { format, folder, texts, preset, scoring, upload: upload.as_ref() };
-    let written = service.folder(&scene, &spec, &mut file);
-    let photos = written.inspect_err(|_| drop(fs_err::remove_file(&part)))?;
-    let size_bytes = file.metadata().map_err(unwritable)?.len();
-    fs_err::rename(&part, &args.output).map_err(unwritable)?;
+    let (photos, size_bytes) = whole(&args.output, |to| service.folder(&scene, &spec, to))?;
     let (path, name, views) = (args.output.display(), format.name, scene.meta.cameras.len());
     let value = json!({
         "output": path.to_string(), "format": name, "views": views, "photos": photos,
@@ -123,4 +127,28 @@ fn folder(
     });
     let text = format!("{path}: {views} views as {name}, {photos} photos, {size_bytes} bytes");
     out.answer(&text, &value)
+}
+
+fn levels(args: &Args, config: &Config, out: &Output) -> Result<()> {
+    let scene = scene_file::open(&args.scene, &config.limits)?.scene;
+    let (levels, size_bytes) = whole(&args.output, |to| scene_levels(&scene, to))?;
+    let (path, count) = (args.output.display(), scene.gaussians.len());
+    let value = json!({
+        "output": path.to_string(), "format": "sog_lod", "gaussians": count, "levels": levels,
+        "size_bytes": size_bytes,
+    });
+    let text = format!("{path}: {count} Gaussians in {levels} levels, {size_bytes} bytes");
+    out.answer(&text, &value)
+}
+
+/// Writes a whole zip, or nothing; gives its bytes, too. Half a zip is of no use, and what was
+/// there before stays until there is a whole one.
+fn whole<T>(path: &Path, write: impl FnOnce(&mut File) -> Result<T>) -> Result<(T, u64)> {
+    let unwritable = |e| scene_file::unwritable(path, e);
+    let part = path.with_added_extension("part");
+    let mut file = File::create(&part).map_err(unwritable)?;
+    let written = write(&mut file).inspect_err(|_| drop(fs_err::remove_file(&part)))?;
+    let size_bytes = file.metadata().map_err(unwritable)?.len();
+    fs_err::rename(&part, path).map_err(unwritable)?;
+    Ok((written, size_bytes))
 }

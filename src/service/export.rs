@@ -14,7 +14,7 @@ use tokio::{
 
 use super::{
     access::SceneAccess,
-    coarse::{LastCoarse, forms},
+    coarse::{LastCoarse, forms_of},
     features,
     page::write_page,
     query,
@@ -30,11 +30,14 @@ use super::{
 use crate::{
     error::{Error, Result},
     formats::{
-        packed::write_packed,
-        splats::{OCTETS, SplatFile, SplatFormat},
+        packed::{CoarseForms, write_packed},
+        splats::{OCTETS, SplatFile, SplatFormat, write_streamed},
         table::{ExportFormat, FormatKind},
     },
-    render::plan::{default_near, widened},
+    render::{
+        coarse::Coarse,
+        plan::{default_near, widened},
+    },
     scene::{Gaussians, Preset, Scene, SceneId, Semantics},
 };
 
@@ -69,6 +72,7 @@ impl Service {
             FormatKind::Folder(folder) => self.folder(id, format, folder, preset, ask).await?,
             FormatKind::Arrays => self.arrays(&access.finished()?, format, ask).await?,
             FormatKind::Packed => self.packed(access.finished()?).await?,
+            FormatKind::Streamed => self.levels(access.finished()?).await?,
             FormatKind::Page => self.page(access.finished()?, preset, ask).await?,
             FormatKind::Splats(splats) => self.splats(access, splats, preset, ask).await?,
         };
@@ -107,7 +111,24 @@ impl Service {
                 return write_packed(&scene, near, None, to);
             };
             let entries = coarse.entries(&scene.gaussians);
-            write_packed(&scene, near, Some(forms(&coarse, &entries)), to)
+            write_packed(&scene, near, Some(forms_of(&coarse, &entries)), to)
+        };
+        Ok(Export::streamed(etag, write).placed(&self.inner, work_bytes, None))
+    }
+
+    /// Levels of detail of the scene.
+    async fn levels(&self, access: SceneAccess) -> Result<Export> {
+        let inner = Arc::clone(&self.inner);
+        let scene = blocking(move || inner.load(&access)).await??;
+        let etag = etag(&semantics_tag(&scene));
+        // The forms, a wider copy of them and of the scene.
+        let count = scene.gaussians.len();
+        let copies = Gaussians::bytes_of(2 * count, scene.gaussians.sh_degree());
+        let work_bytes = LastCoarse::bytes(&scene.gaussians) + copies;
+        let inner = Arc::clone(&self.inner);
+        let write = move |to: &mut dyn Write| {
+            let coarse = inner.coarse.of(&scene)?;
+            write_levels(&scene, coarse.as_deref(), to).map(drop)
         };
         Ok(Export::streamed(etag, write).placed(&self.inner, work_bytes, None))
     }
@@ -265,6 +286,27 @@ pub fn scene_splats(
 ) -> Result<SplatFile> {
     let file = SplatFile::new(format, widened(scene, gaussians, None)?, semantics)?;
     Ok(file.antialiased(scene.meta.report.antialiased))
+}
+
+/// Levels of detail of a scene as a zip that other programs stream, Gaussians as in
+/// [`scene_splats`]. Gives their number.
+///
+/// # Errors
+/// As [`write_streamed`].
+pub fn scene_levels(scene: &Scene, to: &mut dyn Write) -> Result<usize> {
+    let first = scene.meta.cameras.first();
+    let coarse = first.map(|first| Coarse::of(&scene.gaussians, &first.camera)).transpose()?;
+    write_levels(scene, coarse.flatten().as_ref(), to)
+}
+
+/// The same, where the coarser forms are there.
+fn write_levels(scene: &Scene, coarse: Option<&Coarse>, to: &mut dyn Write) -> Result<usize> {
+    let own = widened(scene, &scene.gaussians, None)?;
+    let wide = coarse.map(|coarse| widened(scene, &coarse.gaussians, None)).transpose()?;
+    let forms = coarse.zip(wide.as_ref());
+    let forms = forms.map(|(coarse, gaussians)| CoarseForms { gaussians, ..forms_of(coarse, &[]) });
+    write_streamed(&own, forms, scene.meta.report.antialiased, to)?;
+    Ok(1 + coarse.map_or(0, |coarse| coarse.ends.len()))
 }
 
 /// The parts of a file that `write` writes on a blocking thread. A fault ends them.

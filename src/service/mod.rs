@@ -38,7 +38,7 @@ mod work;
 pub(crate) use self::{create::checked_words, refine::check_refine, request::numbers};
 pub use self::{
     edits::{EditBox, EditOp, EditPick, EditSelection, EditSpec, EditSphere, SceneEdits},
-    export::scene_splats,
+    export::{scene_levels, scene_splats},
     folder::FolderSpec,
     infer::InferSpec,
     memory::Share,

@@ -38,6 +38,7 @@ const SCRIPT: &str = concat!(
     include_str!("../../web/scenes.js"),
     include_str!("../../web/ways.js"),
     include_str!("../../web/keep.js"),
+    include_str!("../../web/vr.js"),
     include_str!("../../web/page.js"),
 );
 

@@ -75,9 +75,9 @@ pub(super) struct Shared {
     /// Permits to run networks.
     pub(super) inferences: Arc<Semaphore>,
     pub(super) key_locks: [tokio::sync::Mutex<()>; KEY_LOCKS],
-    pub(super) memory: Memory,
+    pub(super) memory: Arc<Memory>,
     /// Of the scene whose packed form was read last.
-    pub(super) coarse: LastCoarse,
+    pub(super) coarse: Arc<LastCoarse>,
     /// Whether callers who wait for what is being made are answered at once.
     pub(super) stopping: watch::Sender<bool>,
 }
@@ -121,6 +121,8 @@ impl Service {
         let refiner = Refiner::new(device, config.threads, &config.limits)?;
         let networks = Arc::clone(&parts.scenes);
         let limits = Arc::new(LiveLimits::new(config.limits.clone()));
+        let memory = Arc::new(Memory::new(config.limits.memory_bytes_max));
+        let coarse = Arc::new(LastCoarse::default());
         let job_parts = JobParts {
             store: Arc::clone(&store),
             scenes: parts.scenes,
@@ -131,6 +133,10 @@ impl Service {
             refine: config.refine,
             renderer: Arc::clone(&parts.renderer),
             refiner,
+            foresee: {
+                let (coarse, memory) = (Arc::clone(&coarse), Arc::clone(&memory));
+                Box::new(move |scene| coarse.foresee(scene, &memory))
+            },
             since_last_view: Box::new(move || views.idle()),
         };
         let jobs = Jobs::start(job_parts, records)?;
@@ -153,8 +159,8 @@ impl Service {
             folders: Arc::new(Semaphore::new(config.limits.folder_exports_max)),
             inferences: Arc::new(Semaphore::new(config.limits.inferences_max)),
             key_locks: Default::default(),
-            memory: Memory::new(config.limits.memory_bytes_max),
-            coarse: LastCoarse::default(),
+            memory,
+            coarse,
             stopping: watch::Sender::default(),
             limits,
             config,

@@ -33,6 +33,7 @@ mod inference;
 mod jobs;
 mod keys;
 mod known_words;
+mod levels;
 mod licences;
 mod life;
 mod limits;

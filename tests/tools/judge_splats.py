@@ -12,9 +12,14 @@ import struct
 import subprocess
 import sys
 import tempfile
+import zipfile
 from pathlib import Path
 
+sys.path.append(str(Path(__file__).parents[1] / "page"))
+from large import room  # noqa: E402
+
 segsplat, node, cli, source = map(Path, sys.argv[1:])
+LARGE = 300_000
 # Largest differences of positions, logarithms of scales, opacities and colours.
 STEPS = {
     "ply": (1e-6, 1e-5, 1e-5, 1e-6),
@@ -92,6 +97,22 @@ def faults_of_glb(path: Path) -> list[str]:
     return [f"glb: {one}" for one in found if named not in one["pointer"]]
 
 
+def streamed(of: Path, folder: Path) -> tuple[list[int], int, list[tuple[float, float]]]:
+    """What it finds in the levels of detail of a file: Gaussians of each, the files of all, and
+    least and largest positions of the scene itself."""
+    zipped = folder / f"{of.stem}.sog.zip"
+    subprocess.run([segsplat, "export", of, "-o", zipped], check=True, stdout=subprocess.DEVNULL)
+    with zipfile.ZipFile(zipped) as archive:
+        archive.extractall(folder / of.stem)
+    meta = folder / of.stem / "lod-meta.json"
+    told = subprocess.run([node, cli, "-q", meta, "null", "--stats", "json"],
+                          stdout=subprocess.PIPE, check=True)
+    found = json.loads(told.stdout)
+    data = found["stats"][0]["data"]
+    bounds = list(zip(data["min"][:3], data["max"][:3], strict=True))
+    return found["lodCounts"], len(json.loads(meta.read_text())["filenames"]), bounds
+
+
 count, truth = seen(source)
 faults = []
 with tempfile.TemporaryDirectory() as folder:
@@ -136,4 +157,19 @@ with tempfile.TemporaryDirectory() as folder:
     subprocess.run([segsplat, "export", source, "-o", path], check=True, stdout=subprocess.DEVNULL)
     faults += (wrong := faults_of_glb(path))
     print(f"glb: {len(wrong)} faults")
+    # Levels of detail: of a small scene one, of a large one more, each at most a third as large.
+    large = Path(folder) / "room.splat"
+    large.write_bytes(room(LARGE))
+    for path, want in ((source, count), (large, LARGE)):
+        levels, files, bounds = streamed(path, Path(folder))
+        print(f"sog_lod: {path.name}: {levels} Gaussians in {files} files, bounds {bounds}")
+        steps = zip(levels, levels[1:], strict=False)
+        if levels[0] != want or any(3 * b > a for a, b in steps) \
+                or (len(levels) > 1) != (path == large):
+            faults.append(f"sog_lod: {path.name}: levels of {levels}")
+        of = [truth[name] for name in "xyz"] if path == source else [[-2, 2]] * 3
+        off = max(abs(a - b) for one, two in zip(of, bounds, strict=True)
+                  for a, b in zip(one, two, strict=True))
+        if off > 2e-3:
+            faults.append(f"sog_lod: {path.name}: bounds {off} off")
 sys.exit("\n".join(faults) or None)

@@ -22,7 +22,7 @@ use crate::{
         unreadable,
     },
 };
-use FormatKind::{Arrays, Folder, Packed, Page, Splats};
+use FormatKind::{Arrays, Folder, Packed, Page, Splats, Streamed};
 
 macro_rules! formats {
     ($($(#[doc = $help:literal])+ $format:ident = $number:literal: $name:expr, $title:literal,
@@ -89,6 +89,9 @@ formats! {
     /// The page with the scene in it, as one file for a disk. It shows the texts of `text`, one a
     /// line, and needs no server.
     Html = 4: "html", "one HTML file", "html", OCTETS, true, Page;
+    /// Streamed SOG, the levels of detail of `PlayCanvas`, in a zip: `lod-meta.json` and SOG
+    /// bundles by place and level, which a program loads as it looks at them.
+    SogLod = 15: "sog_lod", "streamed SOG (zip)", "sog.zip", ZIP, false, Streamed;
     /// A folder as COLMAP has it, in a zip: photos, cameras, points and depth maps.
     Colmap = 11: "colmap", "COLMAP (zip)", "colmap.zip", ZIP, false,
         Folder(FolderFormat(colmap::write));
@@ -136,6 +139,8 @@ pub enum FormatKind {
     Packed,
     /// The page with the scene in it.
     Page,
+    /// Levels of detail of the scene in a zip.
+    Streamed,
 }
 
 const ZIP: &str = "application/zip";

@@ -10,12 +10,13 @@
 use std::ops::Range;
 
 use glam::DVec3;
+use rayon::prelude::*;
 
 use crate::{
     blocks::{BLOCKS_MIN, Blocks},
     error::Result,
     merged::{Merged, heaviest},
-    scene::{Camera, Gaussians, RawGaussians},
+    scene::{Camera, Gaussians},
 };
 
 /// Most Gaussians of the coarsest form: 2 MiB of 32 bytes each.
@@ -52,11 +53,9 @@ impl Coarse {
         let Some(&first) = chosen.first() else { return Ok(None) };
         let mut order = layers.ids(first);
         largest_first(&mut order, &merged, own.len(), camera);
-        let (origin, sh_degree) = (own.origin(), own.sh_degree());
-        let mut raw = RawGaussians { origin, sh_degree, ..RawGaussians::default() };
-        let mut all = Vec::new();
+        let (mut ids, mut all) = (Vec::new(), Vec::new());
         for (at, &layer) in chosen.iter().enumerate() {
-            order.iter().for_each(|&id| push(&mut raw, &merged.gaussians, id as usize - own.len()));
+            ids.extend(order.iter().map(|&id| id - own.len() as u32));
             let down = layer - chosen.get(at + 1).copied().unwrap_or(0);
             let (mut below, mut ends) = (Vec::new(), Vec::with_capacity(order.len()));
             for &id in &order {
@@ -66,7 +65,7 @@ impl Coarse {
             all.push(ends);
             order = below;
         }
-        Ok(Some(Self { gaussians: Gaussians::restore(raw)?, ends: all, order }))
+        Ok(Some(Self { gaussians: merged.gaussians.picked(&ids), ends: all, order }))
     }
 
     /// Entries of the bank, one for each of [`Self::gaussians`], where the scene has those of
@@ -77,8 +76,11 @@ impl Coarse {
             let rows: Vec<(u16, f32)> = self.order[self.own_of(form, at)].iter().map(row).collect();
             heaviest(rows)
         };
-        let forms = self.ends.iter().enumerate();
-        forms.flat_map(|(form, ends)| (0..ends.len()).map(move |at| of(form, at))).collect()
+        let mut entries = Vec::with_capacity(self.gaussians.len());
+        for (form, ends) in self.ends.iter().enumerate() {
+            entries.par_extend((0..ends.len()).into_par_iter().map(|at| of(form, at)));
+        }
+        entries
     }
 
     /// Where in [`Self::order`] those begin and end that Gaussian `at` of a form stands for.
@@ -91,18 +93,6 @@ impl Coarse {
         };
         down(at)..down(at + 1)
     }
-}
-
-/// Appends Gaussian `i` of some others.
-fn push(raw: &mut RawGaussians, of: &Gaussians, i: usize) {
-    let k = of.sh_count();
-    raw.means.push(of.means()[i]);
-    raw.quats.push(of.quats()[i]);
-    raw.scales.push(of.scales()[i]);
-    raw.opacities.push(of.opacities()[i]);
-    raw.sh.extend_from_slice(&of.sh()[i * k..(i + 1) * k]);
-    raw.semantic_index.push(0);
-    raw.source.push(of.source()[i]);
 }
 
 /// Appends those that `id` stands for, so many layers below it.

@@ -14,6 +14,8 @@ npz: The semantics as `NumPy` arrays: the bank, the row of each mask, the entry 
 packed: The scene as the page draws it: 32 bytes a Gaussian, those that cover most first.
 html: The page with the scene in it, as one file for a disk. It shows the texts of `text`, one a
     line, and needs no server.
+sog_lod: Streamed SOG, the levels of detail of `PlayCanvas`, in a zip: `lod-meta.json` and SOG
+    bundles by place and level, which a program loads as it looks at them.
 colmap: A folder as COLMAP has it, in a zip: photos, cameras, points and depth maps.
 nerfstudio: The same as nerfstudio has it.
 coco: What each line of `text` selects in each photo as COCO's annotations, in a zip.
@@ -34,6 +36,7 @@ ExportFormat: TypeAlias = Literal[
     "npz",
     "packed",
     "html",
+    "sog_lod",
     "colmap",
     "nerfstudio",
     "coco",
@@ -51,6 +54,7 @@ ENDINGS: dict[ExportFormat, str] = {
     "npz": "npz",
     "packed": "segsplat",
     "html": "html",
+    "sog_lod": "sog.zip",
     "colmap": "colmap.zip",
     "nerfstudio": "nerfstudio.zip",
     "coco": "coco.zip",

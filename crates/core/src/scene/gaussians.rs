@@ -70,21 +70,27 @@ impl RawGaussians {
         lengths.into_iter().find(|(_, got, want)| got != want)
     }
 
-    /// No Gaussians, of the same origin and degree.
-    fn emptied(&self) -> Self {
-        Self { origin: self.origin, sh_degree: self.sh_degree, ..Self::default() }
-    }
-
-    /// Adds Gaussian `i` of `from`.
-    fn push(&mut self, from: &Self, i: usize) {
-        let k = from.sh_count();
-        self.means.push(from.means[i]);
-        self.quats.push(from.quats[i]);
-        self.scales.push(from.scales[i]);
-        self.opacities.push(from.opacities[i]);
-        self.sh.extend_from_slice(&from.sh[i * k..(i + 1) * k]);
-        self.semantic_index.extend(from.semantic_index.get(i));
-        self.source.push(from.source[i]);
+    /// Those with these numbers, in this order.
+    fn picked(&self, ids: &[u32]) -> Self {
+        fn of<T: Copy + Send + Sync>(from: &[T], ids: &[u32]) -> Vec<T> {
+            ids.par_iter().map(|&i| from[i as usize]).collect()
+        }
+        let (k, [index, all]) = (self.sh_count(), [self.semantic_index.len(), self.means.len()]);
+        let mut sh = vec![[0.0; 3]; k * ids.len()];
+        sh.par_chunks_mut(k).zip(ids).for_each(|(row, &i)| {
+            row.copy_from_slice(&self.sh[i as usize * k..(i as usize + 1) * k]);
+        });
+        Self {
+            origin: self.origin,
+            sh_degree: self.sh_degree,
+            means: of(&self.means, ids),
+            quats: of(&self.quats, ids),
+            scales: of(&self.scales, ids),
+            opacities: of(&self.opacities, ids),
+            sh,
+            semantic_index: if index == all { of(&self.semantic_index, ids) } else { Vec::new() },
+            source: of(&self.source, ids),
+        }
     }
 
     /// Adds Gaussians of the same origin and degree.
@@ -100,9 +106,8 @@ impl RawGaussians {
 
     /// The Gaussians whose number `keep` takes, in their order.
     pub(super) fn only(&self, keep: impl Fn(usize) -> bool) -> Self {
-        let mut some = self.emptied();
-        (0..self.means.len()).filter(|&i| keep(i)).for_each(|i| some.push(self, i));
-        some
+        let ids: Vec<u32> = (0..self.means.len() as u32).filter(|&i| keep(i as usize)).collect();
+        self.picked(&ids)
     }
 }
 
@@ -267,9 +272,14 @@ impl Gaussians {
 
     /// The Gaussians whose number `keep` takes, in their order.
     pub fn only(&self, keep: impl Fn(usize) -> bool) -> Self {
-        let kept = self.semantic_index.iter().enumerate().filter(|(i, _)| keep(*i));
-        let semantic_index = kept.map(|(_, entry)| *entry).collect();
-        Self::of(Arc::new(self.raw.only(keep)), semantic_index)
+        let ids: Vec<u32> = (0..self.len() as u32).filter(|&i| keep(i as usize)).collect();
+        self.picked(&ids)
+    }
+
+    /// Those with these numbers, in this order.
+    pub fn picked(&self, ids: &[u32]) -> Self {
+        let semantic_index = ids.iter().map(|&i| self.semantic_index[i as usize]).collect();
+        Self::of(Arc::new(self.raw.picked(ids)), semantic_index)
     }
 
     /// These Gaussians, then `more`, about the origin of these.

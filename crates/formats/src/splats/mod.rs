@@ -14,6 +14,7 @@ mod scene;
 mod sog;
 mod splat;
 mod spz;
+mod streamed;
 
 use std::io::{self, BufRead, Write};
 
@@ -24,6 +25,7 @@ pub use self::{
     sog::SOG,
     splat::SPLAT,
     spz::{SPZ, SPZ4},
+    streamed::write_streamed,
 };
 use crate::{
     container::write_semantics,

@@ -93,7 +93,7 @@ fn bounds(gaussians: &Gaussians, chunk: &[u32]) -> Bounds {
 
 pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
-    let order = morton_order(gaussians);
+    let order = morton_order(0..gaussians.len() as u32, gaussians.means());
     to.write_all(header(file).as_bytes())?;
     for chunk in order.chunks(CHUNK) {
         for bound in bounds(gaussians, chunk).as_flattened().as_flattened() {
@@ -120,11 +120,11 @@ pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     Ok(())
 }
 
-/// The Gaussians along a Morton curve, 21 bits an axis.
-pub(super) fn morton_order(gaussians: &Gaussians) -> Vec<u32> {
-    let means = gaussians.means();
+/// These Gaussians along a Morton curve, 21 bits an axis.
+pub(super) fn morton_order(ids: impl Iterator<Item = u32> + Clone, means: &[[f32; 3]]) -> Vec<u32> {
+    let means = || ids.clone().map(|i| &means[i as usize]);
     let fold = |f: fn(f32, f32) -> f32, start| {
-        means.iter().fold([start; 3], |a, b| std::array::from_fn(|k| f(a[k], b[k])))
+        means().fold([start; 3], |a, b| std::array::from_fn(|k| f(a[k], b[k])))
     };
     let (low, high) = (fold(f32::min, f32::INFINITY), fold(f32::max, f32::NEG_INFINITY));
     let code = |mean: &[f32; 3]| {
@@ -133,7 +133,7 @@ pub(super) fn morton_order(gaussians: &Gaussians) -> Vec<u32> {
             code | spread((part.clamp(0.0, 1.0) * f64::from((1 << 21) - 1)) as u64) << k
         })
     };
-    let mut order: Vec<(u64, u32)> = means.iter().map(code).zip(0..).collect();
+    let mut order: Vec<(u64, u32)> = means().map(code).zip(ids.clone()).collect();
     order.sort_unstable();
     order.into_iter().map(|(_, i)| i).collect()
 }

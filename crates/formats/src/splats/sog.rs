@@ -36,6 +36,7 @@ use super::{
 use crate::{
     error::{Error, Result, short},
     limits::Limits,
+    scene::Gaussians,
 };
 
 /// The bundle of pictures of `PlayCanvas`.
@@ -204,8 +205,24 @@ fn webp([width, height]: [usize; 2], pixels: impl Iterator<Item = [u8; 4]>) -> i
 
 fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
+    let order = morton_order(0..gaussians.len() as u32, gaussians.means());
+    // Not streamed: some readers of zips want sizes before the bytes.
+    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
+    for (name, bytes) in files(gaussians, &order, file.antialiased)? {
+        let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
+        zip.start_file(name, stored)?;
+        zip.write_all(&bytes)?;
+    }
+    to.write_all(zip.finish()?.get_ref())
+}
+
+/// The files of a bundle that has the Gaussians in this order.
+pub(super) fn files(
+    gaussians: &Gaussians,
+    order: &[u32],
+    antialiased: bool,
+) -> io::Result<Vec<(&'static str, Vec<u8>)>> {
     let (n, k) = (gaussians.len(), gaussians.sh_count());
-    let order = morton_order(gaussians);
     let [width, height] = sides(n);
     let place = |i: usize| world(gaussians, i).to_array().map(log);
     let start = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
@@ -227,13 +244,7 @@ fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     };
     let scales = table(gaussians.scales().iter().flatten().map(|scale| scale.ln()));
     let colors = table(gaussians.sh().iter().step_by(k).flatten().copied());
-    // Not streamed: some readers of zips want sizes before the bytes.
-    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
-    let mut put = |name: &str, bytes: &[u8]| -> io::Result<()> {
-        let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
-        zip.start_file(name, stored)?;
-        zip.write_all(bytes)
-    };
+    let mut files = Vec::new();
     let picture = |pixel: &dyn Fn(usize) -> [u8; 4]| {
         webp([width, height], order.iter().map(|&i| pixel(i as usize)))
     };
@@ -241,23 +252,23 @@ fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
         let [x, y, z] = position(i).map(|at| at.to_le_bytes()[of]);
         [x, y, z, 255]
     };
-    put("means_l.webp", &picture(&|i| byte(i, 0))?)?;
-    put("means_u.webp", &picture(&|i| byte(i, 1))?)?;
-    put("quats.webp", &picture(&|i| packed_quat(gaussians.quats()[i]))?)?;
-    put(
+    files.push(("means_l.webp", picture(&|i| byte(i, 0))?));
+    files.push(("means_u.webp", picture(&|i| byte(i, 1))?));
+    files.push(("quats.webp", picture(&|i| packed_quat(gaussians.quats()[i]))?));
+    files.push((
         "scales.webp",
-        &picture(&|i| {
+        picture(&|i| {
             let [x, y, z] = gaussians.scales()[i].map(|scale| nearest(&scales, scale.ln()));
             [x, y, z, 255]
         })?,
-    )?;
-    put(
+    ));
+    files.push((
         "sh0.webp",
-        &picture(&|i| {
+        picture(&|i| {
             let [r, g, b] = gaussians.sh()[i * k].map(|c| nearest(&colors, c));
             [r, g, b, steps(gaussians.opacities()[i], 255).max(1) as u8]
         })?,
-    )?;
+    ));
     let mut meta = json!({
         "version": 2,
         "asset": { "generator": concat!("segsplat ", env!("CARGO_PKG_VERSION")) },
@@ -267,7 +278,7 @@ fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
         "quats": { "files": ["quats.webp"] },
         "sh0": { "codebook": colors, "files": ["sh0.webp"] },
     });
-    if file.antialiased {
+    if antialiased {
         meta["model"] = json!(ANTIALIASED);
     }
     if k > 1 {
@@ -284,19 +295,19 @@ fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
             [r, g, b, 255]
         });
         let sides = [CENTROIDS_A_ROW * (k - 1), count.div_ceil(CENTROIDS_A_ROW)];
-        put("shN_centroids.webp", &webp(sides, pixels)?)?;
+        files.push(("shN_centroids.webp", webp(sides, pixels)?));
         let label = |i: usize| {
             let [low, high] = palette.labels[i].to_le_bytes();
             [low, high, 0, 255]
         };
-        put("shN_labels.webp", &picture(&label)?)?;
+        files.push(("shN_labels.webp", picture(&label)?));
         meta["shN"] = json!({
             "count": count, "bands": gaussians.sh_degree(), "codebook": codebook,
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         });
     }
-    put("meta.json", meta.to_string().as_bytes())?;
-    to.write_all(zip.finish()?.get_ref())
+    files.push(("meta.json", meta.to_string().into_bytes()));
+    Ok(files)
 }
 
 fn bad(why: impl std::fmt::Display) -> Error {
