@@ -527,10 +527,11 @@ pub struct PickResponse {
     /// Accumulated opacity, 0..1.
     #[prost(float, tag = "1")]
     pub alpha: f32,
-    /// Expected depth along the camera's axis, world units; left out where nothing is.
+    /// Depth of the surface along the camera's axis, world units; left out where nothing is. The depth
+    /// that a view blends is up to a percent less where a surface leans.
     #[prost(double, optional, tag = "2")]
     pub depth: ::core::option::Option<f64>,
-    /// Point at that depth.
+    /// Point at that depth; on the ground where it is the ground's.
     #[prost(message, optional, tag = "3")]
     pub point: ::core::option::Option<Vec3>,
     /// The Gaussian that adds most, counted from 0 in the scene's order.

@@ -1,6 +1,10 @@
-//! What lies under a pixel: the ray's own Gaussians, one by one, as the renderers blend them.
+//! What lies under a pixel: the ray's own Gaussians, one by one, as the renderers blend them, and
+//! the place of their surface. A place that is the ground's, as far as depth is known, is on it:
+//! thousands of Gaussians tell where that is.
 
 use std::sync::Arc;
+
+use glam::DVec2;
 
 use super::{
     request::{PickSpec, PictureKind, ViewSpec},
@@ -16,9 +20,13 @@ use crate::{
     error::{Error, Result},
     limits::Limits,
     names::shown,
-    render::{Kinds, oracle::contributions},
+    render::{Kinds, oracle::contributions, surface},
     scene::{Scene, SceneId},
 };
+
+/// How far from the ground, as a share of the depth, a surface may be that is the ground's, at the
+/// median depth of the scene and beyond. What is nearer is known the better.
+const UNSURE: f64 = 0.03;
 
 /// The view of a pick.
 pub(super) fn pick_view<'a>(
@@ -31,6 +39,12 @@ pub(super) fn pick_view<'a>(
         inputs,
         &ViewSpec::new(spec.camera, PictureKind::Alpha, spec.options.clone()),
     )
+}
+
+/// The depth of a surface where a ray meets the ground at another one.
+fn grounded(depth: f64, ground: f64, median: f64) -> f64 {
+    let unsure = UNSURE * (ground / median).min(1.0);
+    if (depth / ground - 1.0).abs() <= unsure { ground } else { depth }
 }
 
 /// Depth, point and Gaussian of a pixel of a view.
@@ -54,12 +68,17 @@ pub(super) fn pick(scene: &Scene, view: &Resolved, [x, y]: [f64; 2]) -> Result<P
     if alpha <= 0.0 {
         return Ok(picked);
     }
-    let depth = found.iter().map(|one| one.weight * one.depth).sum::<f64>() / alpha;
+    let blended = found.iter().map(|one| one.weight * one.depth).sum::<f64>() / alpha;
     let [u, v] = whole.map(|at| f64::from(at) + 0.5);
-    let point = lens.unproject(u, v, depth);
-    let world = request.camera.camera_to_world.matrix().transform_point3(point);
+    let depth = surface::depth(&scene.gaussians, &request, DVec2::new(u, v), blended)?;
+    let mut depth = depth.unwrap_or(blended);
+    let pose = request.camera.camera_to_world;
+    let way = pose.rotation() * lens.unproject(u, v, 1.0);
+    if let Some(ground) = scene.ground().and_then(|ground| ground.along(pose.center(), way)) {
+        depth = grounded(depth, ground, scene.meta.report.median_depth);
+    }
     picked.depth = Some(depth);
-    picked.point = Some(world.to_array());
+    picked.point = Some((pose.center() + way * depth).to_array());
     let strongest = found.iter().max_by(|a, b| a.weight.total_cmp(&b.weight));
     if let Some(one) = strongest {
         picked.gaussian = Some(one.gaussian as u64);
@@ -118,5 +137,19 @@ impl Service {
             Ok(picked)
         };
         inner.scheduled(Demand::view(&self.caller, 1), deadline, "the pick", pick).await
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::grounded;
+
+    #[test]
+    fn what_is_the_grounds_as_far_as_depth_is_known_is_on_it() {
+        assert_eq!(grounded(3.9, 4.0, 4.0), 4.0, "2.5 % at the median depth");
+        assert_eq!(grounded(7.8, 8.0, 4.0), 8.0, "no more is forgiven beyond it");
+        assert_eq!(grounded(7.7, 8.0, 4.0), 7.7, "3.75 %");
+        assert_eq!(grounded(0.975, 1.0, 4.0), 0.975, "near, a thing that lies on it");
+        assert_eq!(grounded(0.995, 1.0, 4.0), 1.0);
     }
 }

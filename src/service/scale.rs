@@ -21,7 +21,7 @@ use crate::{
     error::{Error, Result},
     limits::Limits,
     names::display_names,
-    scene::{Gaussians, Ground, LengthUnit, Scene, SceneCamera, SceneId, ground},
+    scene::{Gaussians, Ground, LengthUnit, Scene, SceneCamera, SceneId},
 };
 
 /// Metres a unit that are accepted.
@@ -128,7 +128,7 @@ impl SceneScale {
     fn of(scene: &Scene, given: Option<f64>) -> Self {
         let report = &scene.meta.report;
         let up = SceneCamera::level_up(&scene.meta.cameras);
-        let ground = ground(&scene.gaussians, up, report.median_depth);
+        let ground = scene.ground();
         let (metres_per_unit, source) = match (given, report.cameras.unit) {
             (Some(given), _) => (Some(given), ScaleSource::Given),
             (None, LengthUnit::Metre) => (Some(1.0), ScaleSource::Capture),

@@ -165,9 +165,10 @@ pub struct Peak {
 pub struct Picked {
     /// Accumulated opacity, 0..1.
     pub alpha: f32,
-    /// Expected depth along the camera's axis, world units; none where nothing is.
+    /// Depth of the surface along the camera's axis, world units; none where nothing is. The
+    /// depth that a view blends is up to a percent less where a surface leans.
     pub depth: Option<f64>,
-    /// Point at that depth, world frame of the upload.
+    /// Point at that depth, world frame of the upload; on the ground where it is the ground's.
     pub point: Option<[f64; 3]>,
     /// The Gaussian that adds most, counted from 0 in the scene's order.
     pub gaussian: Option<u64>,

@@ -207,7 +207,7 @@ def test_masks_fit_the_photo_that_was_asked(client: Client, tmp_path: Path) -> N
     # A pixel of a mask is that of a pick.
     picked = scene.pick(600.5, 440.5, from_=1)
     there = scene.view("depth", from_=1, width=640)
-    assert picked.depth == pytest.approx(float(there.depth[440, 600]))
+    assert picked.depth == pytest.approx(float(there.depth[440, 600]), rel=0.05)
     listed = next(one for one in client.scenes() if one.id == scene.id)
     assert listed.query("box", from_=1).masks.shape == (1, 480, 640)
     scene.delete()

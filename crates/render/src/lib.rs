@@ -28,6 +28,7 @@ mod places;
 pub mod plan;
 pub mod renderer;
 pub mod select;
+pub mod surface;
 #[cfg(feature = "testing")]
 pub mod switches;
 #[cfg(not(feature = "testing"))]

@@ -873,9 +873,10 @@ class Picked:
 
     #: Accumulated opacity, 0 to 1.
     alpha: float
-    #: Depth along the camera's axis, world units; None where nothing is.
+    #: Depth of the surface along the camera's axis, world units; None where nothing is. The depth
+    #: that a view blends is up to a percent less where a surface leans.
     depth: float | None = None
-    #: [3] point at that depth, world frame of the upload.
+    #: [3] point at that depth, world frame of the upload; on the ground where it is the ground's.
     point: Floats | None = None
     #: The Gaussian that adds most, counted from 0.
     gaussian: int | None = None

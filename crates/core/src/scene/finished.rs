@@ -1,12 +1,15 @@
 //! A finished scene: its Gaussians, its sources and its report.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use serde::{Deserialize, Serialize};
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Backdrop, Gaussians, HealthReport, SceneCamera, SceneId, SceneOptions, Semantics},
+    scene::{
+        Backdrop, Gaussians, Ground, HealthReport, SceneCamera, SceneId, SceneOptions, Semantics,
+        ground,
+    },
 };
 
 /// A photo of the upload and its hash.
@@ -66,6 +69,8 @@ pub struct Scene {
     pub semantics_sha256: String,
     /// sha256 of the list of edits that its Gaussians have behind them, hex; empty where none.
     pub edits_sha256: String,
+    /// What [`Self::ground`] found.
+    pub found_ground: OnceLock<Option<Ground>>,
 }
 
 impl Scene {
@@ -79,7 +84,17 @@ impl Scene {
             sha256: String::new(),
             semantics_sha256: String::new(),
             edits_sha256: String::new(),
+            found_ground: OnceLock::new(),
         }
+    }
+
+    /// The ground of the scene as it was made: searched once, and kept through edits.
+    #[must_use]
+    pub fn ground(&self) -> Option<Ground> {
+        *self.found_ground.get_or_init(|| {
+            let up = SceneCamera::level_up(&self.meta.cameras);
+            ground(&self.gaussians, up, self.meta.report.median_depth)
+        })
     }
 
     /// Bytes held by its arrays.
@@ -101,6 +116,7 @@ impl Scene {
             let index = gaussians.semantic_index().to_vec();
             Arc::new(Semantics { index, ..(**semantics).clone() })
         });
+        let _ = self.ground();
         Self { gaussians, semantics, edits_sha256, ..self.clone() }
     }
 

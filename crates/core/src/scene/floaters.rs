@@ -1,9 +1,10 @@
 //! Gaussians that no photo confirms: they float in front of what photos see.
 //!
 //! Each Gaussian names the photo that gave it. What a photo gave is, cell by cell of its picture,
-//! how far it sees. A Gaussian of another photo that lies well in front of that is seen through,
-//! and one at that depth is confirmed; behind it, it is hidden, and nothing is said. A floater is
-//! seen through by two photos or more, and confirmed by none.
+//! how far it sees. A Gaussian that lies well in front of most of that is seen through, and one at
+//! a depth where the photo has others is confirmed; behind it, it is hidden, and nothing is said.
+//! A floater is confirmed by no other photo, and seen through by two, or by the one that gave it:
+//! there it stands alone before what this photo sees.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -14,12 +15,15 @@ use crate::scene::{Gaussians, SceneCamera};
 const CELLS: u32 = 48;
 /// Photos that are asked of each Gaussian, evenly chosen of the others.
 const ASKED_MAX: usize = 24;
-/// Share of the Gaussians of a cell, on each side, whose depth says nothing.
-const TRIM: f64 = 0.1;
-/// How far in front of what a photo sees, as a share of its depth, a Gaussian is seen through.
-const IN_FRONT: f64 = 0.1;
-/// Photos that see through a floater, at least.
+/// How far before or behind another Gaussian, as a share of the depth, is not beside it.
+const BESIDE: f64 = 0.05;
+/// Share of the Gaussians of a cell beside one that is confirmed; a photo's own floaters are fewer.
+const CONFIRMED: f64 = 0.05;
+/// Share of the Gaussians of a cell that are behind one that is seen through.
+const BEHIND: f64 = 0.5;
+/// What must see through a floater, at least: photos, of which the one that gave it counts `OWN`.
 const THROUGH_MIN: usize = 2;
+const OWN: usize = 2;
 
 /// Fewest photos of a scene that can have floaters.
 pub const FLOATERS_PHOTOS_MIN: usize = 3;
@@ -54,13 +58,15 @@ pub fn floaters(gaussians: &Gaussians, cameras: &[SceneCamera]) -> Vec<bool> {
         .map(|(photo, place)| {
             let mut through = 0;
             for (other, seen) in seen.iter().enumerate() {
-                if other == *photo || (other + photo) % step != 0 {
+                let is_own = other == *photo;
+                if !is_own && (other + photo) % step != 0 {
                     continue;
                 }
-                match seen.says(*place) {
-                    Some(Says::Confirmed) => return false,
-                    Some(Says::Through) => through += 1,
-                    None => {}
+                match (seen.says(*place, is_own), is_own) {
+                    (Some(Says::Through), true) => through += OWN,
+                    (Some(Says::Through), false) => through += 1,
+                    (Some(Says::Confirmed), false) => return false,
+                    _ => {}
                 }
             }
             through >= THROUGH_MIN
@@ -79,8 +85,8 @@ struct Seen<'c> {
     /// Pixels of a cell.
     cell: f64,
     width: usize,
-    /// Nearest and farthest depth of each cell; none where it gave nothing.
-    depths: Vec<Option<[f64; 2]>>,
+    /// The depths of each cell, ascending.
+    depths: Vec<Vec<f64>>,
 }
 
 impl<'c> Seen<'c> {
@@ -91,18 +97,13 @@ impl<'c> Seen<'c> {
         let side = |length: u32| ((f64::from(length) / cell).ceil() as usize).max(1);
         let (width, height) = (side(lens.width), side(lens.height));
         let mut seen = Self { camera, cell, width, depths: Vec::new() };
-        let mut all: Vec<Vec<f64>> = vec![Vec::new(); width * height];
+        seen.depths.resize(width * height, Vec::new());
         for place in own {
             if let Some((at, z)) = seen.at(*place) {
-                all[at].push(z);
+                seen.depths[at].push(z);
             }
         }
-        let between = |mut cell: Vec<f64>| {
-            cell.sort_by(f64::total_cmp);
-            let out = (TRIM * cell.len() as f64) as usize;
-            Some([*cell.get(out)?, *cell.get(cell.len() - 1 - out)?])
-        };
-        seen.depths = all.into_iter().map(between).collect();
+        seen.depths.iter_mut().for_each(|cell| cell.sort_by(f64::total_cmp));
         seen
     }
 
@@ -121,13 +122,19 @@ impl<'c> Seen<'c> {
         Some(((y / self.cell) as usize * self.width + (x / self.cell) as usize, seen.z))
     }
 
-    fn says(&self, place: DVec3) -> Option<Says> {
+    /// Of a place, which is one of its own or not.
+    fn says(&self, place: DVec3, is_own: bool) -> Option<Says> {
         let (at, z) = self.at(place)?;
-        let [near, far] = (*self.depths.get(at)?)?;
-        if z < near * (1.0 - IN_FRONT) {
-            return Some(Says::Through);
+        let cell = self.depths.get(at).filter(|cell| !cell.is_empty())?;
+        let before = |z: f64| cell.partition_point(|one| *one < z);
+        let [nearer, all_but_behind] = [z * (1.0 - BESIDE), z / (1.0 - BESIDE)].map(before);
+        let beside = all_but_behind - nearer - usize::from(is_own);
+        let all = cell.len() as f64;
+        if beside as f64 > CONFIRMED * all {
+            return Some(Says::Confirmed);
         }
-        (z <= far * (1.0 + IN_FRONT)).then_some(Says::Confirmed)
+        let behind = (cell.len() - all_but_behind) as f64;
+        (behind >= BEHIND * all).then_some(Says::Through)
     }
 }
 
@@ -175,12 +182,12 @@ mod tests {
 
     #[test]
     fn what_two_photos_see_through_and_none_confirms_floats() {
-        // In front of the wall; near it; behind it; beside all photos but its own.
+        // In front of the wall; near it; behind it; where its own photo alone sees the wall.
         let more = [[0.3, 0.0, 2.0], [0.3, 0.1, 3.9], [0.3, 0.0, 6.0], [-1.0, 0.0, 2.0]];
         let (gaussians, cameras) = scene(5, &more);
         let found = floaters(&gaussians, &cameras);
         let count = gaussians.len();
-        assert_eq!(found[count - 4..], [true, false, false, false]);
+        assert_eq!(found[count - 4..], [true, false, false, true]);
         assert!(!found[..count - 4].contains(&true), "the wall stays");
         let (gaussians, cameras) = scene(2, &more);
         assert!(!floaters(&gaussians, &cameras).contains(&true), "one other photo is too few");

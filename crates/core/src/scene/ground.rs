@@ -1,14 +1,16 @@
 //! The ground of a scene, and lengths in it.
 //!
-//! The ground is the plane, nearly level, that most Gaussians lie on, of those with next to nothing
-//! under them: of a room its floor, of a table that fills the photos the table.
+//! The ground is the plane, nearly level, that most Gaussians lie on, of those with little under
+//! them: of a room its floor, of a table that fills the photos the table. The more a plane leans,
+//! or has under it, the less it counts: a plane through a table and the floor beyond it holds more
+//! than the floor, and is none.
 
-use glam::{DMat3, DVec3};
+use glam::DVec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use crate::scene::Gaussians;
+use crate::scene::{Gaussians, biweight, least_squares};
 
 /// Opacity from which a Gaussian is a surface.
 const OPACITY_MIN: f32 = 0.5;
@@ -20,12 +22,16 @@ const TRIED_ON: usize = 2_048;
 const PLANES: u32 = 20_000;
 /// Largest angle between up as the photos tell it and the ground's, degrees.
 const TILT_MAX: f64 = 20.0;
+/// Angle at which a plane counts 1/e of a level one, degrees.
+const TILT: f64 = 8.0;
 /// How far from the plane its Gaussians are, as a share of the median depth.
 const THICK: f64 = 0.01;
-/// Most of the Gaussians that may be under the ground, as a share of all.
-const UNDER_MAX: f64 = 0.05;
+/// Share of all Gaussians that may be under the ground.
+const UNDER: f64 = 0.05;
+/// Share with which a plane counts nothing.
+const UNDER_MAX: f64 = 0.3;
 /// Fewest Gaussians that are a ground, as a share of all.
-const SHARE_MIN: f64 = 0.05;
+const SHARE_MIN: f64 = 0.04;
 /// Rounds in which the plane is fitted to its Gaussians.
 const ROUNDS: usize = 6;
 
@@ -46,19 +52,24 @@ impl Ground {
     pub fn height(&self, point: DVec3) -> f64 {
         DVec3::from(self.normal).dot(point - DVec3::from(self.point))
     }
+
+    /// How many times `way` it is from `eye` to the ground; `None` where that never meets it.
+    #[must_use]
+    pub fn along(&self, eye: DVec3, way: DVec3) -> Option<f64> {
+        let times = -self.height(eye) / DVec3::from(self.normal).dot(way);
+        (times.is_finite() && times > 0.0).then_some(times)
+    }
 }
 
 /// The ground of Gaussians whose median depth in their photos is `depth`; `up` is what the photos
 /// say of it. `None` where too little is level.
 #[must_use]
 pub fn ground(gaussians: &Gaussians, up: DVec3, depth: f64) -> Option<Ground> {
-    let seen: Vec<DVec3> = gaussians
-        .means()
-        .iter()
-        .zip(gaussians.opacities())
-        .filter(|(_, opacity)| **opacity >= OPACITY_MIN)
-        .map(|(mean, _)| DVec3::from(mean.map(f64::from)))
-        .collect();
+    let opacities = gaussians.opacities().iter().map(|opacity| f64::from(*opacity));
+    let means = gaussians.means().iter().map(|mean| DVec3::from(mean.map(f64::from)));
+    let all: Vec<(DVec3, f64)> = means.zip(opacities).collect();
+    let seen = all.iter().filter(|(_, opacity)| *opacity >= f64::from(OPACITY_MIN));
+    let seen: Vec<DVec3> = seen.map(|(mean, _)| *mean).collect();
     let points: Vec<DVec3> = some(&seen, SAMPLES);
     let thick = THICK * depth;
     if points.len() < 16 || thick.is_nan() || thick <= 0.0 {
@@ -74,21 +85,24 @@ pub fn ground(gaussians: &Gaussians, up: DVec3, depth: f64) -> Option<Ground> {
             return None;
         }
         let plane = (normal, normal.dot(a));
-        Some((share(&tried_on, plane, thick)?, i, plane))
+        let [on, under] = shares(&tried_on, plane, thick);
+        let tilt = normal.angle_between(up).to_degrees() / TILT;
+        let alone = ((UNDER_MAX - under) / (UNDER_MAX - UNDER)).clamp(0.0, 1.0);
+        Some((on * alone * (-tilt * tilt).exp(), i, plane))
     };
-    let best = (0..PLANES).into_par_iter().filter_map(try_one);
+    let best = (0..PLANES).into_par_iter().filter_map(try_one).filter(|tried| tried.0 > 0.0);
     let best = best.max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)));
     let (_, _, mut plane) = best?;
     for _ in 0..ROUNDS {
-        plane = fitted(&points, plane, thick)?;
+        plane = fitted(&all, plane, thick)?;
     }
     let (normal, along) = plane;
-    let share = share(&points, plane, thick).filter(|share| *share >= SHARE_MIN)?;
+    let [share, _] = shares(&points, plane, thick);
     let on: Vec<DVec3> =
         points.iter().filter(|p| (normal.dot(**p) - along).abs() <= thick).copied().collect();
     let middle = on.iter().sum::<DVec3>() / on.len().max(1) as f64;
     let point = middle + normal * (along - normal.dot(middle)) + gaussians.origin();
-    (normal.dot(up) >= level).then_some(Ground {
+    (share >= SHARE_MIN && normal.dot(up) >= level).then_some(Ground {
         normal: normal.to_array(),
         point: point.to_array(),
         share,
@@ -108,38 +122,35 @@ fn number(i: u32) -> u32 {
     x ^ (x >> 15)
 }
 
-/// The share of points on a plane (normal, place along it); `None` where too many are under it.
-fn share(points: &[DVec3], (normal, along): (DVec3, f64), thick: f64) -> Option<f64> {
+/// The shares of points on a plane (normal, place along it), and under it.
+fn shares(points: &[DVec3], (normal, along): (DVec3, f64), thick: f64) -> [f64; 2] {
     let (mut on, mut under) = (0_usize, 0_usize);
     for point in points {
         let height = normal.dot(*point) - along;
         on += usize::from(height.abs() <= thick);
         under += usize::from(height < -3.0 * thick);
     }
-    let all = points.len() as f64;
-    (under as f64 / all <= UNDER_MAX).then_some(on as f64 / all)
+    [on, under].map(|count| count as f64 / points.len() as f64)
 }
 
-/// The plane with the least squared heights of the points near this one.
-fn fitted(points: &[DVec3], (normal, along): (DVec3, f64), thick: f64) -> Option<(DVec3, f64)> {
-    let near: Vec<DVec3> = points
-        .iter()
-        .filter(|point| (normal.dot(**point) - along).abs() <= thick)
-        .copied()
-        .collect();
-    let middle = near.iter().sum::<DVec3>() / near.len().max(1) as f64;
+/// The plane with the least squared heights of the points near this one, by their weights.
+fn fitted(
+    points: &[(DVec3, f64)],
+    (normal, along): (DVec3, f64),
+    thick: f64,
+) -> Option<(DVec3, f64)> {
+    let weigh = |(point, weight): &(DVec3, f64)| {
+        let weight = weight * biweight(normal.dot(*point) - along, thick);
+        (weight > 0.0).then_some((*point, weight))
+    };
+    let near: Vec<(DVec3, f64)> = points.iter().filter_map(weigh).collect();
+    let total: f64 = near.iter().map(|(_, weight)| weight).sum();
+    let middle = near.iter().map(|(point, weight)| *point * *weight).sum::<DVec3>() / total;
     let (x, y) = normal.any_orthonormal_pair();
-    let (mut square, mut side) = (DMat3::ZERO, DVec3::ZERO);
-    for point in &near {
+    let slope = least_squares(near.iter().map(|(point, weight)| {
         let from = *point - middle;
-        let row = DVec3::new(from.dot(x), from.dot(y), 1.0);
-        square += DMat3::from_cols(row * row.x, row * row.y, row);
-        side += row * from.dot(normal);
-    }
-    if near.len() < 8 || square.determinant() <= 0.0 {
-        return None;
-    }
-    let slope = square.inverse() * side;
+        (DVec3::new(from.dot(x), from.dot(y), 1.0), from.dot(normal), *weight)
+    }))?;
     let normal = (normal - x * slope.x - y * slope.y).try_normalize()?;
     Some((normal, normal.dot(middle)))
 }
@@ -197,6 +208,36 @@ mod tests {
             assert!((got - height).abs() < 0.02, "{got} is not {height}");
         }
         assert!((0.15..0.3).contains(&found.share), "{}", found.share);
+    }
+
+    /// A table that fills the photos, and of the floor little beyond it, of another depth than it
+    /// has: a plane through both holds most, and has nothing under it.
+    #[test]
+    fn a_plane_that_leans_on_a_table_is_no_ground() {
+        let points: Vec<DVec3> = (0..20_000)
+            .map(|i| {
+                let [a, b, c] = [0, 1, 2].map(|k| drawn(i, k));
+                let noise = 0.01 * (c - 0.5);
+                match i % 20 {
+                    0..2 => DVec3::new(2.0 * a - 1.0, noise, 2.5 + b),
+                    2..9 => DVec3::new(2.0 * a - 1.0, -0.75 + noise, b),
+                    9..13 => DVec3::new(2.0 * a - 1.0, -0.75 + 0.3 * (b + 0.4) + noise, b + 0.9),
+                    _ => DVec3::new(2.0 * a - 1.0, -0.8 - b, 3.5 * c),
+                }
+            })
+            .collect();
+        let found = ground(&of(&points, DVec3::ZERO), DVec3::NEG_Y, 3.0).unwrap();
+        let off = DVec3::from(found.normal).angle_between(DVec3::NEG_Y).to_degrees();
+        assert!(off < 2.0, "{off} degrees off, {found:?}");
+    }
+
+    #[test]
+    fn a_ray_meets_the_ground_in_front_of_it_alone() {
+        let ground = Ground { normal: [0.0, -1.0, 0.0], point: [3.0, 1.0, 0.0], share: 0.2 };
+        let eye = DVec3::new(0.0, -1.0, 0.0);
+        assert_eq!(ground.along(eye, DVec3::new(0.5, 0.25, 1.0)), Some(8.0));
+        assert_eq!(ground.along(eye, DVec3::new(0.5, -0.25, 1.0)), None, "up");
+        assert_eq!(ground.along(eye, DVec3::Z), None, "level");
     }
 
     #[test]

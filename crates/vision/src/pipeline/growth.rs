@@ -36,11 +36,12 @@ const BEHIND: f64 = 0.05;
 /// a refinement.
 const LEARNT_SIDE: u32 = 640;
 
-/// Old photos that judge whether a scene that is made again is as good: those nearest to new ones.
-const JUDGES: usize = 6;
+/// Old photos that judge whether a scene that is made again is as good: those nearest to new ones,
+/// of which most decide. So one that gains or loses a lot does not outweigh the others.
+const JUDGES: usize = 5;
 /// Longer side of the pictures that they judge, pixels.
 const JUDGED_SIDE: u32 = 320;
-/// What they may lose in the mean, dB.
+/// What one may lose and find it as good, dB.
 const LOST_DB: f64 = 0.05;
 
 /// What the networks make of photos some of which are new.
@@ -214,8 +215,8 @@ pub fn version(
     Ok(Reconstruction { gaussians, backdrop: (*served.backdrop).clone(), report, cameras })
 }
 
-/// Whether a scene that was made again of `photos` is as good as `served` at the photos that stay,
-/// each left out of both.
+/// Whether a scene that was made again of `photos` is as good as `served` at most of the photos
+/// that stay and judge it, each left out of both.
 fn is_as_good(
     renderer: &dyn Renderer,
     served: &Scene,
@@ -229,15 +230,46 @@ fn is_as_good(
         ..served.meta.clone()
     };
     let made = Scene::new(meta, made.gaussians.clone(), made.backdrop.clone());
-    let mut gain = 0.0;
-    for photo in judges(photos, kept.len(), made.meta.report.median_depth) {
+    let judges = judges(photos, kept.len(), made.meta.report.median_depth);
+    let mut votes = Votes::of(judges.len());
+    for photo in judges {
+        if let Some(decided) = votes.decided() {
+            return Ok(decided);
+        }
         let truth = at_side(&photos[photo], JUDGED_SIDE);
         let of = |scene: &Scene, number| judged_without(renderer, scene, number, &truth);
         if let (Some(old), Some(new)) = (of(served, kept[photo])?, of(&made, photo)?) {
-            gain += new.psnr - old.psnr + LOST_DB;
+            votes.count(new.psnr - old.psnr + LOST_DB >= 0.0);
         }
     }
-    Ok(gain >= 0.0)
+    Ok(votes.decided().unwrap_or(votes.no == 0))
+}
+
+/// What judges say of a scene.
+struct Votes {
+    judges: usize,
+    yes: usize,
+    no: usize,
+}
+
+impl Votes {
+    fn of(judges: usize) -> Self {
+        Self { judges, yes: 0, no: 0 }
+    }
+
+    fn count(&mut self, yes: bool) {
+        let votes = if yes { &mut self.yes } else { &mut self.no };
+        *votes += 1;
+    }
+
+    /// What most say, or half that it is worse; `None` before that is sure.
+    fn decided(&self) -> Option<bool> {
+        match self {
+            _ if 2 * self.yes > self.judges => Some(true),
+            _ if self.no > 0 && 2 * self.no >= self.judges => Some(false),
+            _ => None,
+        }
+    }
 }
 
 /// The photos of the first `before` that are nearest to one of the others, at most [`JUDGES`].
@@ -312,4 +344,33 @@ fn looks(
         Ok(Look { camera, depth, alpha })
     };
     cameras.iter().map(look).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Votes;
+
+    fn decided(judges: usize, votes: &[bool]) -> (Option<bool>, usize) {
+        let mut of = Votes::of(judges);
+        let asked = votes.iter().take_while(|vote| {
+            let open = of.decided().is_none();
+            if open {
+                of.count(**vote);
+            }
+            open
+        });
+        let asked = asked.count();
+        (of.decided(), asked)
+    }
+
+    #[test]
+    fn most_judges_decide_and_no_more_are_asked() {
+        assert_eq!(decided(5, &[true; 5]), (Some(true), 3));
+        assert_eq!(decided(5, &[false, true, true, false, false]), (Some(false), 5));
+        assert_eq!(decided(5, &[true, false, true, false, true]), (Some(true), 5));
+        assert_eq!(decided(4, &[true, false, true, false]), (Some(false), 4), "half lose");
+        assert_eq!(decided(2, &[true, true]), (Some(true), 2));
+        assert_eq!(decided(1, &[false]), (Some(false), 1));
+        assert_eq!(decided(3, &[true]), (None, 1), "two could not be drawn");
+    }
 }
