@@ -59,9 +59,6 @@ const LEFT_OUT_FACTOR: f64 = 2.0;
 /// A proof that differs so many times as much from the held-out photos as from learnt ones is no
 /// proof: nothing is published (docs/adr/0073).
 const OVERFIT_REFUSED: f64 = 6.0;
-/// Where a proof overfits, scenes of fewer photos lose by steps beyond those of the first part, and
-/// scenes of more photos gain (docs/adr/0101).
-const STEPS_FREE_FROM: usize = 16;
 
 /// The work on a version makes all that was done this many times as long.
 const LONGER: u32 = 4;
@@ -112,8 +109,7 @@ pub struct RefineCalls<'a> {
 /// together ([`Judged::score`]), the work ends: so more time is never worse. It also ends where the
 /// proof overfits, for what its held-out photos gain then, other views lose: with the first
 /// version where that one's proof does so ([`RefineOptions::overfit_max`]), which has no more steps
-/// than the first part where photos are few, and before a further one
-/// ([`RefineOptions::overfit_further`]).
+/// than the first part in any time, and before a further one ([`RefineOptions::overfit_further`]).
 ///
 /// The first scene of all photos goes on from the proof's Gaussians, and those of the held-out
 /// photos, where the proof explains these nearly as well as photos that it learnt
@@ -268,11 +264,10 @@ impl Parts<'_, '_> {
                 Some(whole) => whole,
                 None => self.begin_whole(&proof, overfits)?,
             };
-            let mut budget = self.rest_of(part, proven.time);
-            if overfits && self.photos.len() < STEPS_FREE_FROM {
-                let share = 1.0 - self.proof_share();
-                budget.steps = budget.steps.min(share_of(self.options.first_steps, share).max(1));
-            }
+            let budget = match overfits {
+                true => self.budget_of_overfit(),
+                false => self.rest_of(part, proven.time),
+            };
             let options = RefineOptions { budget, ..options };
             found.report = self.publish(&mut made, &mut proof, &options)?;
             found.versions += 1;
@@ -628,6 +623,14 @@ impl Parts<'_, '_> {
             left.steps / 2 < rest.steps
         };
         if is_last { left } else { rest }
+    }
+
+    /// What the one version of a proof that overfits has: the steps of the first part in any time
+    /// that suffices for them, for more lose (docs/adr/0108).
+    fn budget_of_overfit(&self) -> RefineBudget {
+        let left = self.left();
+        let steps = share_of(self.options.first_steps, 1.0 - self.proof_share()).max(1);
+        RefineBudget { steps: steps.min(left.steps), ..left }
     }
 
     /// Whether time is what ends it.

@@ -356,6 +356,15 @@ fn a_proof_that_overfits_ends_the_work_and_one_without_worth_publishes_nothing()
     // What is left of the budget is not for a scene whose proof overfits.
     let first = RefineOptions { overfit_max: 0.0, ..steps_of(60, 40) };
     assert_eq!((steps(steps_of(60, 40)), steps(first)), ((1, 50), (1, 30)));
+    // In a long time it has as many steps as in a short one, of many photos too.
+    let (_, many) = captured(16);
+    let of_many = |steps: u32| {
+        let options = RefineOptions { overfit_max: 0.0, ..steps_of(steps, 20) };
+        let whole = refined_whole(&cpu(), &many, &options, &|| ());
+        assert_eq!((whole.found.versions, whole.found.report.steps), (1, 15), "of {steps}");
+        whole.last().1.gaussians.means().to_vec()
+    };
+    assert!(of_many(24) == of_many(640), "more time changes nothing");
     // Noise in the held-out photos, that nothing explains.
     let mut random = Random(3);
     for at in held_out(photos.len()) {
