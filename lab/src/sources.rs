@@ -20,7 +20,32 @@ pub(crate) const GROUPS: [(&str, &[&str]); 9] = [
             "crates/render/src/plan.rs",
         ],
     ),
-    ("kernels", &["crates/render/src", "shaders"]),
+    // Not what is made of Gaussians beside pictures (`coarse.rs`, `surface.rs`).
+    (
+        "kernels",
+        &[
+            "crates/render/src/backward",
+            "crates/render/src/blocks.rs",
+            "crates/render/src/budget.rs",
+            "crates/render/src/constants.rs",
+            "crates/render/src/cpu",
+            "crates/render/src/gpu",
+            "crates/render/src/labels.rs",
+            "crates/render/src/levels.rs",
+            "crates/render/src/lib.rs",
+            "crates/render/src/merged.rs",
+            "crates/render/src/options.rs",
+            "crates/render/src/oracle.rs",
+            "crates/render/src/plan.rs",
+            "crates/render/src/places.rs",
+            "crates/render/src/renderer.rs",
+            "crates/render/src/select.rs",
+            "crates/render/src/switches.rs",
+            "crates/render/src/train",
+            "crates/render/src/view.rs",
+            "shaders",
+        ],
+    ),
     ("networks", &["models/embedded"]),
     // Photos to Gaussians.
     (
