@@ -191,7 +191,12 @@ fn a_scene_is_written_as_a_folder_with_the_photos_that_are_named() {
         assert!(left.is_empty(), "nothing is written, not {left:?}");
     };
     let invalid = ErrorCode::InvalidRequest;
-    refuse("x.zip", &[], invalid, "splat, colmap.zip, nerfstudio.zip, coco.zip, labelme.zip");
+    refuse(
+        "x.zip",
+        &[],
+        invalid,
+        "splat, sog.zip, colmap.zip, nerfstudio.zip, coco.zip, labelme.zip",
+    );
     refuse("x.ply", &["--text", "a"], invalid, "--photos and --text go with folders, not with ply");
     refuse("x.colmap.zip", &["--text", "a", CPU[0], CPU[1]], invalid, "not with colmap");
     refuse("x.colmap.zip", &["--photos", "none"], invalid, "cannot be read");

@@ -275,6 +275,7 @@ async fn the_command_line_has_what_http_has() {
         match (name.strip_prefix("format="), call) {
             (Some("compressed_ply"), _) => words.any(|word| word == "compressed.ply"),
             (Some("spz4"), _) => words.any(|word| word == "v4.spz"),
+            (Some("sog_lod"), _) => words.any(|word| word == "sog.zip"),
             (Some(format), _) => {
                 words.any(|word| word == format || word == format!("{format}.zip"))
             }

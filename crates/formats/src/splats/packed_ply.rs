@@ -93,7 +93,7 @@ fn bounds(gaussians: &Gaussians, chunk: &[u32]) -> Bounds {
 
 pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
-    let order = morton_order(0..gaussians.len() as u32, gaussians.means());
+    let order = morton_order(&(0..gaussians.len() as u32), gaussians.means());
     to.write_all(header(file).as_bytes())?;
     for chunk in order.chunks(CHUNK) {
         for bound in bounds(gaussians, chunk).as_flattened().as_flattened() {
@@ -121,7 +121,10 @@ pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
 }
 
 /// These Gaussians along a Morton curve, 21 bits an axis.
-pub(super) fn morton_order(ids: impl Iterator<Item = u32> + Clone, means: &[[f32; 3]]) -> Vec<u32> {
+pub(super) fn morton_order(
+    ids: &(impl Iterator<Item = u32> + Clone),
+    means: &[[f32; 3]],
+) -> Vec<u32> {
     let means = || ids.clone().map(|i| &means[i as usize]);
     let fold = |f: fn(f32, f32) -> f32, start| {
         means().fold([start; 3], |a, b| std::array::from_fn(|k| f(a[k], b[k])))

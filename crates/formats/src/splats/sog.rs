@@ -205,7 +205,7 @@ fn webp([width, height]: [usize; 2], pixels: impl Iterator<Item = [u8; 4]>) -> i
 
 fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
-    let order = morton_order(0..gaussians.len() as u32, gaussians.means());
+    let order = morton_order(&(0..gaussians.len() as u32), gaussians.means());
     // Not streamed: some readers of zips want sizes before the bytes.
     let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
     for (name, bytes) in files(gaussians, &order, file.antialiased)? {

@@ -185,7 +185,7 @@ impl Writer<'_, '_> {
                 Some(forms) if level == 0 => places.map(|at| forms.order[at]).collect(),
                 _ => places.map(|at| (first + at) as u32).collect(),
             };
-            let near = morton_order(ids.into_iter(), gaussians.means());
+            let near = morton_order(&ids.into_iter(), gaussians.means());
             let bounds = near.iter().map(|&i| Bound::of(gaussians, i as usize));
             bound = bounds.fold(bound, Bound::around);
             if self.open[level].is_empty() {
