@@ -174,8 +174,8 @@ impl Bundle {
     }
 
     /// How surely the photos' turns are known: the covariance of each camera's turn, about the mean
-    /// of all and in the world, for keypoints that are off by a pixel along x and along y. `None`
-    /// where the equations do not tell.
+    /// of all and in the world, for keypoints that are off by a pixel along x and along y; zero of
+    /// cameras that no sight names. `None` where the equations do not tell.
     pub(crate) fn turns(&self, fixed: usize, options: &AdjustOptions) -> Option<Vec<Matrix3<f64>>> {
         let Equations { slot, mut system, .. } = self.equations(fixed, options, 0.0);
         // Nothing tells the scale.
@@ -199,7 +199,10 @@ impl Bundle {
             .map(|i| cameras.iter().map(|&j| both(i, j)).sum::<Matrix3<f64>>() / count)
             .collect();
         let of_mean = cameras.iter().map(|&i| with_mean[i]).sum::<Matrix3<f64>>() / count;
-        let about_mean = |i: usize| both(i, i) - with_mean[i] - with_mean[i].transpose() + of_mean;
+        let about_mean = |i: usize| match cameras.contains(&i) {
+            true => both(i, i) - with_mean[i] - with_mean[i].transpose() + of_mean,
+            false => Matrix3::zeros(),
+        };
         Some((0..slot.len()).map(about_mean).collect())
     }
 
@@ -410,8 +413,9 @@ mod tests {
         };
         let prior = LensPrior { focal: 500.0, log_spread: 1.0, known: true, k1_spread: 1.0 };
         let right = Bundle {
-            poses: (0..4).map(pose).collect(),
-            lens_of: vec![0; 4],
+            // No sight names the fifth.
+            poses: (0..5).map(pose).collect(),
+            lens_of: vec![0; 5],
             lenses: vec![lens],
             priors: vec![prior],
             sights: (0..points.len()).map(sights).collect(),
@@ -437,6 +441,7 @@ mod tests {
                 *seen += (turn - mean).norm_squared() / TRIALS as f64;
             }
         }
+        assert_eq!(said[4], Matrix3::zeros());
         for (i, (said, seen)) in said.iter().zip(seen).enumerate() {
             let ratio = (seen / (said.trace() * NOISE * NOISE)).sqrt();
             assert!((ratio - 1.0).abs() < 0.1, "camera {i}: {ratio} times what is said");

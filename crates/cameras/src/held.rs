@@ -72,10 +72,11 @@ pub(crate) fn drop_loose(survey: &Survey, best: &mut Candidate, cancel: &AtomicB
 
 /// The photo whose turn is known least, where that is too little.
 fn loosest(survey: &Survey, best: &Candidate, cancel: &AtomicBool) -> Option<usize> {
-    let placed = best.grown.poses.iter().flatten().count();
     let turns = turns_deg(survey, best, cancel)?;
-    let loosest = (0..turns.len()).max_by(|&a, &b| turns[a].total_cmp(&turns[b]))?;
-    (placed > PHOTOS_MIN && turns[loosest] > TURN_MAX_DEG).then_some(loosest)
+    let is_placed = |photo: &usize| best.grown.poses[*photo].is_some();
+    let placed: Vec<usize> = (0..turns.len()).filter(is_placed).collect();
+    let loosest = *placed.iter().max_by(|a, b| turns[**a].total_cmp(&turns[**b]))?;
+    (placed.len() > PHOTOS_MIN && turns[loosest] > TURN_MAX_DEG).then_some(loosest)
 }
 
 /// The deviation of each photo's turn, degrees, for keypoints that are off each by itself, by as
