@@ -16,7 +16,7 @@ use crate::{
 /// A photo is left out where fewer of its points are seen by two more photos.
 const POINTS_MIN: usize = 25;
 /// A photo is left out where its turn is known by less, degrees: the deviation for keypoints that
-/// are off each by itself. They are off together: cameras are up to thirty times as far off.
+/// are off each by itself. They are off together: the worst are some thirty times as far off.
 const TURN_MAX_DEG: f64 = 0.15;
 /// Photos that stay: two confirm nothing.
 const PHOTOS_MIN: usize = 3;
