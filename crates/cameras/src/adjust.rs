@@ -54,6 +54,17 @@ pub(crate) struct Bundle {
 type Block = SMatrix<f64, 6, 3>;
 type LensBlock = SMatrix<f64, 2, 3>;
 
+/// The normal equations of cameras and lenses.
+struct Equations {
+    /// The first number of each camera that moves.
+    slot: Vec<Option<usize>>,
+    /// The first number of the lenses.
+    lens_at: usize,
+    system: DMatrix<f64>,
+    right: DVector<f64>,
+    parts: Vec<Option<PointPart>>,
+}
+
 /// A point's part of the normal equations.
 struct PointPart {
     inverse: Matrix3<f64>,
@@ -63,6 +74,8 @@ struct PointPart {
 }
 
 const LENS_PARAMS: usize = 2;
+/// What holds the scale where nothing tells it, as a share of what holds the surest number.
+const NO_SCALE: f64 = 1e-10;
 /// Spreads from which on a lens is thought to be another than was said (Cauchy's loss), of its
 /// focal length and of k1: EXIF may lie, and most lenses are plain, but not all.
 const DOUBTS: [f64; 2] = [3.0, 1.0];
@@ -123,8 +136,8 @@ impl Bundle {
         cost
     }
 
-    /// The state after one step, or `None` where the equations cannot be solved.
-    fn step(&self, fixed: usize, options: &AdjustOptions, damping: f64) -> Option<Self> {
+    /// The equations of cameras and lenses, the points eliminated.
+    fn equations(&self, fixed: usize, options: &AdjustOptions, damping: f64) -> Equations {
         let mut slot = vec![None; self.poses.len()];
         let mut cameras = 0;
         for sight in self.sights.iter().flatten() {
@@ -157,6 +170,46 @@ impl Bundle {
         for i in 0..size {
             system[(i, i)] += 1e-12;
         }
+        Equations { slot, lens_at, system, right, parts }
+    }
+
+    /// How surely the photos' turns are known: the covariance of each camera's turn, about the mean
+    /// of all and in the world, for keypoints that are off by a pixel along x and along y; zero of
+    /// cameras that no sight names. `None` where the equations do not tell.
+    pub(crate) fn turns(&self, fixed: usize, options: &AdjustOptions) -> Option<Vec<Matrix3<f64>>> {
+        let Equations { slot, mut system, .. } = self.equations(fixed, options, 0.0);
+        // Nothing tells the scale.
+        let least = NO_SCALE * system.diagonal().max();
+        for i in 0..system.nrows() {
+            system[(i, i)] += least;
+        }
+        let inverse = system.cholesky()?.inverse();
+        let cameras: Vec<usize> =
+            (0..slot.len()).filter(|&i| i == fixed || slot[i].is_some()).collect();
+        let both = |i: usize, j: usize| match (slot[i], slot[j]) {
+            (Some(row), Some(column)) => {
+                let own = inverse.fixed_view::<3, 3>(row, column);
+                self.poses[i].r.transpose() * own * self.poses[j].r
+            }
+            // The fixed camera does not turn.
+            _ => Matrix3::zeros(),
+        };
+        let count = cameras.len() as f64;
+        let with_mean: Vec<Matrix3<f64>> = (0..slot.len())
+            .map(|i| cameras.iter().map(|&j| both(i, j)).sum::<Matrix3<f64>>() / count)
+            .collect();
+        let of_mean = cameras.iter().map(|&i| with_mean[i]).sum::<Matrix3<f64>>() / count;
+        let about_mean = |i: usize| match cameras.contains(&i) {
+            true => both(i, i) - with_mean[i] - with_mean[i].transpose() + of_mean,
+            false => Matrix3::zeros(),
+        };
+        Some((0..slot.len()).map(about_mean).collect())
+    }
+
+    /// The state after one step, or `None` where the equations cannot be solved.
+    fn step(&self, fixed: usize, options: &AdjustOptions, damping: f64) -> Option<Self> {
+        let Equations { slot, lens_at, system, right, parts } =
+            self.equations(fixed, options, damping);
         let delta = system.cholesky()?.solve(&right);
         let mut next = self.clone();
         for (pose, place) in next.poses.iter_mut().zip(&slot) {
@@ -318,5 +371,81 @@ impl Bundle {
                 right[at + k] += weight * rest;
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Matrix3, Vector2, Vector3};
+
+    use super::{AdjustOptions, Bundle, LensPrior, Sight};
+    use crate::{
+        lens::Lens,
+        pose::{Pose, rotation},
+        rng::Rng,
+    };
+
+    /// The turn of a rotation, axis times angle, where it is small.
+    fn turn_of(r: &Matrix3<f64>) -> Vector3<f64> {
+        Vector3::new(r[(2, 1)] - r[(1, 2)], r[(0, 2)] - r[(2, 0)], r[(1, 0)] - r[(0, 1)]) * 0.5
+    }
+
+    #[test]
+    fn turns_are_known_as_well_as_trials_say() {
+        const TRIALS: usize = 400;
+        const NOISE: f64 = 0.4;
+        let mut rng = Rng::new(3, 0);
+        let mut draw = || rng.below(1 << 20) as f64 / f64::from(1 << 20) - 0.5;
+        let lens = Lens { focal: 500.0, k1: 0.0 };
+        let points: Vec<Vector3<f64>> =
+            (0..40).map(|_| Vector3::new(3.0 * draw(), 2.0 * draw(), 5.0 + 2.0 * draw())).collect();
+        let pose = |i: usize| {
+            let along = i as f64 - 1.5;
+            let r = rotation(&Vector3::new(0.05 * along, 0.12 * along, 0.6 * along));
+            Pose { r, t: -(r * Vector3::new(0.6 * along, 0.1, 0.0)) }
+        };
+        let exact = |i: usize, point: &Vector3<f64>| lens.project(&pose(i).seen(point)).unwrap();
+        // The last camera sees a quarter of the points.
+        let sees = |i: usize, k: usize| i != 3 || k.is_multiple_of(4);
+        let sights = |k: usize| {
+            let own = (0..4).filter(|&i| sees(i, k));
+            own.map(|i| Sight { camera: i, pixel: exact(i, &points[k]) }).collect()
+        };
+        let prior = LensPrior { focal: 500.0, log_spread: 1.0, known: true, k1_spread: 1.0 };
+        let right = Bundle {
+            // No sight names the fifth.
+            poses: (0..5).map(pose).collect(),
+            lens_of: vec![0; 5],
+            lenses: vec![lens],
+            priors: vec![prior],
+            sights: (0..points.len()).map(sights).collect(),
+            points,
+        };
+        let options =
+            AdjustOptions { steps: 6, free_focal: false, free_k1: false, scale_px: 1000.0 };
+        let said = right.turns(0, &options).unwrap();
+        let mut seen = [0.0; 4];
+        for _ in 0..TRIALS {
+            let mut bundle = right.clone();
+            for sight in bundle.sights.iter_mut().flatten() {
+                // A sum of twelve is normal enough; its deviation is 1.
+                let mut normal = || (0..12).map(|_| draw()).sum::<f64>();
+                sight.pixel += Vector2::new(normal(), normal()) * NOISE;
+            }
+            bundle.adjust(0, &options);
+            let turns: Vec<Vector3<f64>> = (0..4)
+                .map(|i| turn_of(&(right.poses[i].r.transpose() * bundle.poses[i].r)))
+                .collect();
+            let mean = turns.iter().sum::<Vector3<f64>>() / 4.0;
+            for (seen, turn) in seen.iter_mut().zip(&turns) {
+                *seen += (turn - mean).norm_squared() / TRIALS as f64;
+            }
+        }
+        assert_eq!(said[4], Matrix3::zeros());
+        for (i, (said, seen)) in said.iter().zip(seen).enumerate() {
+            let ratio = (seen / (said.trace() * NOISE * NOISE)).sqrt();
+            assert!((ratio - 1.0).abs() < 0.1, "camera {i}: {ratio} times what is said");
+        }
+        assert!(said[3].trace() > 2.0 * said[2].trace(), "few points hold the last camera");
     }
 }

@@ -327,7 +327,7 @@ impl<'a> Grower<'a> {
         Some(turns.iter().any(|(strength, off)| *strength > 0.3 * strongest && *off < TURN_MAX_DEG))
     }
 
-    fn options(&self, steps: usize) -> AdjustOptions {
+    pub(crate) fn options(&self, steps: usize) -> AdjustOptions {
         let placed = self.placed();
         let scale_px = self.survey.views.iter().map(|v| v.agree_px).fold(0.0, f64::max) * 0.5;
         AdjustOptions {
@@ -356,7 +356,7 @@ impl<'a> Grower<'a> {
 
     /// The state as a bundle, and the track of each of its points. Of each photo only the points
     /// that most others see count: those that few see carry the drift of keypoints.
-    fn bundle(&self) -> (Bundle, Vec<usize>) {
+    pub(crate) fn bundle(&self) -> (Bundle, Vec<usize>) {
         let mut tracks = Vec::new();
         let mut points = Vec::new();
         let mut sights = Vec::new();

@@ -51,15 +51,25 @@ pub(crate) fn drop_weak(
         if weak.is_empty() || 2 * weak.len() >= best.grown.poses.iter().flatten().count() {
             return (links, dropped);
         }
-        let mut grower = Grower::new(survey, &best.tracks, &[], &best.grown.lenses, cancel);
-        grower.state = best.grown.clone();
-        for photo in &weak {
-            grower.state.poses[*photo] = None;
-        }
-        grower.settle();
-        best.grown = grower.state;
+        without(survey, best, &weak, cancel);
         dropped.extend(weak);
     }
+}
+
+/// Takes photos out of a solution and adjusts the others.
+pub(crate) fn without(
+    survey: &Survey,
+    best: &mut Candidate,
+    photos: &[usize],
+    cancel: &AtomicBool,
+) {
+    let mut grower = Grower::new(survey, &best.tracks, &[], &best.grown.lenses, cancel);
+    grower.state = best.grown.clone();
+    for photo in photos {
+        grower.state.poses[*photo] = None;
+    }
+    grower.settle();
+    best.grown = grower.state;
 }
 
 /// The placed photos that strong links do not join with the largest part.

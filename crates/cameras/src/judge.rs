@@ -6,6 +6,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use crate::{
     grow::{Grower, Grown, angle_between},
+    held,
     joints::{weakest, weakest_min},
     pose::{Pose, angle_deg},
     solution::Evidence,
@@ -168,17 +169,12 @@ pub(crate) fn evidence(
         }
     }
     let mirrored = mirrored(survey, best);
-    let mut held = vec![0; grown.poses.len()];
+    let held = held::points(best);
     let mut angles = Vec::new();
     let mut errors = Vec::new();
     for ((track, agrees), point) in best.tracks.iter().zip(&grown.agrees).zip(&grown.points) {
         let Some(point) = point else { continue };
         let near: Vec<_> = track.iter().zip(agrees).filter(|(_, a)| **a).map(|(s, _)| s).collect();
-        if near.len() >= 3 {
-            for sighting in &near {
-                held[sighting.0 as usize] += 1;
-            }
-        }
         let rays: Vec<Vector3<f64>> = near
             .iter()
             .filter_map(|s| {
@@ -296,4 +292,31 @@ fn points_in_both(survey: &Survey, best: &Candidate, ends: [(usize, &Pose); 2]) 
             && (0.6..1.7).contains(&scale)
     });
     seen.count()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::strongest;
+    use crate::{grow::Grown, solver::Candidate};
+
+    fn scored(score: f64) -> Candidate {
+        let (poses, lenses, points, agrees) = (vec![], vec![], vec![], vec![]);
+        let grown = Grown { poses, lenses, points, agrees };
+        Candidate { grown, links: vec![], tracks: vec![], score }
+    }
+
+    #[test]
+    fn a_rival_that_ends_at_the_same_cameras_is_none() {
+        let all = [0.99, 0.97, 0.93, 0.8].map(scored);
+        let rivals = || all.iter().map(|other| (other.score, other)).collect();
+        assert_eq!(strongest(rivals(), |_| true), 0.99);
+        assert_eq!(strongest(rivals(), |other| other.score < 0.98), 0.97);
+        // What costs no confidence is not finished for it.
+        let is_one = |other: &Candidate| {
+            assert!(other.score > 0.9, "{} is asked", other.score);
+            false
+        };
+        assert_eq!(strongest(rivals(), is_one), 0.8);
+        assert_eq!(strongest(Vec::new(), |_| true), 0.0);
+    }
 }

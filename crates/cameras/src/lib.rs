@@ -10,6 +10,7 @@ mod adjust;
 mod five_point;
 mod given;
 mod grow;
+mod held;
 mod joints;
 mod judge;
 mod lens;

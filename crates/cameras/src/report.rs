@@ -15,12 +15,30 @@ const MATCHES_FEW: usize = 30;
 /// Focal lengths further than this from what EXIF says are told, as a share.
 const EXIF_OFF: f64 = 0.08;
 
+/// Photos that were taken out of a solution.
+#[derive(Default)]
+pub(crate) struct Dropped {
+    /// Those that only weak pairs join with the others.
+    pub(crate) weak: Vec<usize>,
+    /// Those that few points hold, and how many.
+    pub(crate) few: Vec<(usize, usize)>,
+    /// Those whose turn is not known.
+    pub(crate) loose: Vec<usize>,
+}
+
 /// Why a photo has no camera.
-pub(crate) fn why_left_out(survey: &Survey, photo: usize, dropped: &[usize]) -> String {
+pub(crate) fn why_left_out(survey: &Survey, photo: usize, dropped: &Dropped) -> String {
     let keypoints = survey.views[photo].pixels.len();
     let own = survey.pairs.iter().filter(|pair| pair.photos.contains(&photo));
     let most = own.map(|pair| pair.matches.len()).max().unwrap_or(0);
-    if dropped.contains(&photo) {
+    let held = dropped.few.iter().find(|(few, _)| *few == photo);
+    if let Some((_, points)) = held {
+        format!("only {points} of its points are seen by two other photos: its camera is not sure")
+    } else if dropped.loose.contains(&photo) {
+        "what it shows leaves its camera open by degrees: it may be far from the other photos, or \
+         show few things that are near"
+            .to_owned()
+    } else if dropped.weak.contains(&photo) {
         "its matches with the other photos contradict each other: it may show another place, or \
          another side of a thing that looks alike"
             .to_owned()

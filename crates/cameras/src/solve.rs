@@ -9,9 +9,10 @@ use segsplat_core::{
 
 use crate::{
     given::{PairMatches, PhotoKeypoints, SolveOptions, check},
-    joints, judge,
+    held, joints, judge,
     patch::Grey,
-    report, sharpen,
+    report::{self, Dropped},
+    sharpen,
     solution::{Evidence, Placing, Solution},
     solver, world,
 };
@@ -50,7 +51,8 @@ pub fn solve(
     let candidates = solver::candidates(&survey, cancel, progress)?;
     let mut candidates = candidates.into_iter();
     let Some(mut best) = candidates.next() else {
-        let left_out = |photo| Placing::LeftOut(report::why_left_out(&survey, photo, &[]));
+        let left_out =
+            |photo| Placing::LeftOut(report::why_left_out(&survey, photo, &Dropped::default()));
         return Ok(Solution {
             photos: (0..photos.len()).map(left_out).collect(),
             points: Vec::new(),
@@ -63,12 +65,18 @@ pub fn solve(
     // As they were grown: what is finished explains more than what is not.
     let rivals = judge::rivals(&survey, &best, &others);
     solver::finish(&survey, &mut best, cancel);
-    let (links, dropped) = joints::drop_weak(&survey, &mut best, cancel);
+    let (links, weak) = joints::drop_weak(&survey, &mut best, cancel);
+    let few = held::drop_few(&survey, &mut best, cancel);
     let with_pixels = !greys.is_empty();
-    let (seen, sharp) = match with_pixels {
+    let (seen, mut sharp) = match with_pixels {
         true => sharpen::sharpened(&survey, greys, &best, cancel),
         false => (survey.clone(), best.clone()),
     };
+    let loose = held::drop_loose(&seen, &mut sharp, cancel);
+    if !loose.is_empty() {
+        joints::without(&survey, &mut best, &loose, cancel);
+    }
+    let dropped = Dropped { weak, few, loose };
     // What ends at the same cameras is no other solution.
     let is_other = |other: &solver::Candidate| {
         !with_pixels || judge::differ(&sharp, &sharpen::ended(&survey, greys, other, cancel))

@@ -77,6 +77,20 @@ fn focal_lengths_are_found_without_exif_and_with_a_wrong_one() {
 }
 
 #[test]
+fn a_focal_length_of_exif_that_is_far_off_does_not_hold_the_cameras() {
+    for exif in [0.8, 1.25] {
+        let plan = Plan { noise: 0.5, cameras: arc(4, 30.0, 4.0), ..plan() };
+        let (mut photos, pairs) = photos(&plan);
+        photos.iter_mut().for_each(|photo| photo.focal = Some(exif * plan.focal));
+        let solution = solved(&photos, &pairs).expect("a solution");
+        let off = off(&solution, &plan);
+        assert!((off.focal - 1.0).abs() < 0.03, "{exif}: {}", off.focal);
+        let is_said = |warning: &String| warning.contains("from that of EXIF");
+        assert!(solution.warnings.iter().any(is_said), "{exif}: {:?}", solution.warnings);
+    }
+}
+
+#[test]
 fn a_photo_of_another_place_is_left_out_and_named() {
     let plan = Plan { noise: 0.5, wrong: 0.2, ..plan() };
     let (mut photos, mut pairs) = photos(&plan);
@@ -97,6 +111,43 @@ fn a_photo_of_another_place_is_left_out_and_named() {
     assert!(off.degrees < 0.5, "{} degrees", off.degrees);
     assert!(matches!(&solution.photos[3], Placing::LeftOut(why) if !why.is_empty()));
     assert!(solution.warnings.iter().any(|w| w.contains("photo 3")), "{:?}", solution.warnings);
+}
+
+#[test]
+fn a_photo_that_few_points_hold_is_left_out_and_the_others_are_trusted() {
+    let plan = Plan { noise: 0.5, ..plan() };
+    let (photos, mut pairs) = photos(&plan);
+    pairs.iter_mut().filter(|pair| pair.photos[1] == 7).for_each(|pair| pair.pairs.truncate(18));
+    let solution = solved(&photos, &pairs).expect("a solution");
+    let off = off(&solution, &plan);
+    assert_eq!(off.placed, 7);
+    assert!(off.degrees < 0.5, "{} degrees", off.degrees);
+    assert!(solution.confidence > 0.8, "{:?}", solution.evidence);
+    let Placing::LeftOut(why) = &solution.photos[7] else { panic!("photo 7 has a camera") };
+    assert!(why.starts_with("only 18 of its points"), "{why}");
+}
+
+#[test]
+fn a_photo_whose_turn_its_points_leave_open_is_left_out_and_named() {
+    // Photo 7 shows things of a hand's width alone, which a step aside moves as a turn does.
+    for (reach, placed) in [(0.06, 7), (0.6, 8)] {
+        let mut points = plan().points;
+        points.extend(cloud(120, reach, 12));
+        let plan = Plan { points, noise: 0.5, ..plan() };
+        let (photos, mut pairs) = photos(&plan);
+        for pair in pairs.iter_mut().filter(|pair| pair.photos[1] == 7) {
+            let first = pair.pairs.len() - 120;
+            pair.pairs.drain(..first);
+        }
+        let solution = solved(&photos, &pairs).expect("a solution");
+        let off = off(&solution, &plan);
+        assert_eq!(off.placed, placed, "{reach}: {} degrees", off.degrees);
+        assert!(off.degrees < 0.5, "{reach}: {} degrees", off.degrees);
+        assert!(solution.confidence > 0.8, "{reach}: {:?}", solution.evidence);
+        if let Placing::LeftOut(why) = &solution.photos[7] {
+            assert!(why.contains("open by degrees"), "{why}");
+        }
+    }
 }
 
 #[test]
