@@ -1,4 +1,5 @@
-//! Levels of detail of a large scene, as a folder that other programs stream.
+//! Levels of detail of a large scene: made once when it is done, given to the page, and as a
+//! folder that other programs stream.
 
 use std::{
     collections::HashMap,
@@ -7,14 +8,25 @@ use std::{
 
 use glam::DVec3;
 use segsplat::{
-    formats::{packed::CoarseForms, splats::write_streamed, table::read_splats},
+    formats::{
+        packed::CoarseForms,
+        splats::{SPLAT, SplatFile, write_streamed},
+        table::read_splats,
+    },
     limits::Limits,
     render::{blocks::BLOCKS_MIN, coarse::Coarse},
-    scene::Gaussians,
+    scene::{Gaussians, Upload, UploadFile},
 };
 use segsplat_testing::scenes::{camera, cloud};
 use serde_json::Value;
 use zip::{ZipArchive, ZipWriter, write::SimpleFileOptions};
+
+use crate::common::{
+    client,
+    doors::{Options, http},
+    process::eventually,
+    server::TestServer,
+};
 
 type Files = HashMap<String, Vec<u8>>;
 
@@ -140,4 +152,32 @@ fn each_level_is_the_whole_scene_by_place() {
         let off = ours.iter().zip(theirs).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
         assert!(off < 1e-3 * wide, "axis {axis}: {off} of {wide}");
     }
+}
+
+#[tokio::test]
+async fn forms_are_made_when_a_scene_is_done_and_not_by_its_readers() {
+    let server = TestServer::with(|_, _| {}).await;
+    let mut bytes = Vec::new();
+    let file = SplatFile::new(&SPLAT, cloud(BLOCKS_MIN + 40_000, 0, 5), None).unwrap();
+    file.write(&mut bytes).unwrap();
+    let splats = UploadFile { name: "large.splat".to_owned(), bytes };
+    let upload = Upload { splats: Some(splats), ..Upload::default() };
+    let get = async |path: String| client().get(server.url(&path)).send().await.unwrap();
+    let made = async || {
+        let text = get("/metrics".to_owned()).await.text().await.unwrap();
+        let name = "segsplat_stage_seconds_count{stage=\"coarse\"} ";
+        text.lines().find_map(|line| line.strip_prefix(name)?.parse::<f64>().ok()).unwrap_or(0.0)
+    };
+    let before = made().await;
+    let (id, _) = http(server.addr).create(&upload, &Options::wait()).await.unwrap();
+    eventually("the forms", async || (made().await > before).then_some(())).await;
+    for format in ["packed", "sog_lod", "packed"] {
+        let answer = get(format!("/v1/scenes/{id}/export?format={format}")).await;
+        let bytes = answer.bytes().await.unwrap();
+        if format == "sog_lod" {
+            let counts: Vec<usize> = levels(&bytes).iter().map(Vec::len).collect();
+            assert!(counts[0] >= BLOCKS_MIN && counts.len() > 1, "{counts:?}");
+        }
+    }
+    assert!((made().await - before - 1.0).abs() < 0.5, "readers take those that are there");
 }

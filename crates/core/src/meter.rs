@@ -9,8 +9,8 @@ use crate::scene::Stage;
 /// Name of the metric: time of each stage, by `stage`.
 pub const STAGE_SECONDS: &str = "segsplat_stage_seconds";
 
-/// Stages of a view, and the wait of a job for its worker.
-const OTHERS: [&str; 6] = ["wait", "queue", "load", "score", "render", "encode"];
+/// Stages of a view, the wait of a job for its worker, and the coarser forms of a large scene.
+const OTHERS: [&str; 7] = ["wait", "queue", "load", "score", "render", "encode", "coarse"];
 
 /// Stages of a scene, of its semantics, and of a view.
 pub fn stages() -> impl Iterator<Item = &'static str> {
