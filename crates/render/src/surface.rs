@@ -140,7 +140,8 @@ mod tests {
     fn a_floor_is_where_it_is_and_not_where_it_is_blended() {
         let noise = |x: u32, y: u32| 1.0 + 0.01 * (f64::from((x * 7 + y * 13) % 11) / 10.0 - 0.5);
         let scene = floor(noise);
-        for pixel in [[80, 90], [40, 80], [120, 100]] {
+        // The last one has no Gaussians under it, so what is around it is not as deep in the mean.
+        for pixel in [[80, 90], [40, 80], [120, 100], [80, 118]] {
             let [blended, depth] = found(&scene, pixel);
             assert!(blended < -0.004, "what is nearer is in front: {blended}");
             assert!(depth.abs() < 0.001, "{depth} at {pixel:?}; blended: {blended}");
@@ -160,7 +161,8 @@ mod tests {
     fn a_few_gaussians_are_no_surface() {
         let (all, request) = floor(|_, _| 1.0);
         let at = DVec2::new(80.5, 90.5);
-        let few = all.only(|i| i % 1_000 == 0);
+        // Four of the 50 that are near.
+        let few = all.only(|i| i % 11 == 0);
         assert_eq!(depth(&few, &request, at, true_depth(90.5)).unwrap(), None);
         assert_eq!(depth(&all, &request, at, 9.0).unwrap(), None, "nothing is there");
     }
