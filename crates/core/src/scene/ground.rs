@@ -32,6 +32,8 @@ const UNDER: f64 = 0.05;
 const UNDER_MAX: f64 = 0.3;
 /// Fewest Gaussians that are a ground, as a share of all.
 const SHARE_MIN: f64 = 0.04;
+/// Fewest Gaussians that a plane is fitted to.
+const GAUSSIANS_MIN: usize = 8;
 /// Rounds in which the plane is fitted to its Gaussians.
 const ROUNDS: usize = 6;
 
@@ -144,6 +146,9 @@ fn fitted(
         (weight > 0.0).then_some((*point, weight))
     };
     let near: Vec<(DVec3, f64)> = points.iter().filter_map(weigh).collect();
+    if near.len() < GAUSSIANS_MIN {
+        return None;
+    }
     let total: f64 = near.iter().map(|(_, weight)| weight).sum();
     let middle = near.iter().map(|(point, weight)| *point * *weight).sum::<DVec3>() / total;
     let (x, y) = normal.any_orthonormal_pair();
@@ -249,6 +254,7 @@ mod tests {
         let cloud: Vec<DVec3> =
             (0..4_000).map(|i| 4.0 * DVec3::from([0, 1, 2].map(|k| drawn(i, k)))).collect();
         assert_eq!(ground(&of(&cloud, DVec3::ZERO), DVec3::NEG_Y, 3.0), None);
+        assert_eq!(ground(&of(&cloud[..40], DVec3::ZERO), DVec3::NEG_Y, 3.0), None, "few");
         assert_eq!(ground(&of(&[], DVec3::ZERO), DVec3::NEG_Y, 3.0), None);
         assert_eq!(ground(&of(&wall, DVec3::ZERO), DVec3::NEG_Y, 0.0), None);
     }
