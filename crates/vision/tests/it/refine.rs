@@ -219,6 +219,7 @@ fn photos_on_disk_are_learnt_beside_the_others() {
         coarse_share: 0.4,
         coarse_side_min: 20,
         growth: 0.0,
+        dropout: 0.0,
         ..RefineOptions::default()
     };
     let gaussians = ready(&scene, &start, &options).expect("Gaussians");
@@ -428,7 +429,12 @@ fn large_photos_are_learnt_at_half_their_size_first() {
 fn steps_leave_gaussians_out_from_the_second_part_on_but_not_the_last_of_a_part() {
     let (_, photos) = captured(9);
     let renderer = watched();
-    let options = RefineOptions { dropout: 0.25, ..steps_of(160, 40) };
+    let options = RefineOptions {
+        dropout: 0.25,
+        gain_min: f64::MIN,
+        overfit_further: f32::MAX,
+        ..steps_of(160, 40)
+    };
     assert_eq!(refined_whole(&renderer, &photos, &options, &|| ()).found.versions, 2);
     let steps = renderer.steps.into_inner().expect("a lock");
     let dropouts: Vec<Dropout> = steps.iter().map(|step| step.dropout).collect();
