@@ -433,6 +433,7 @@ fn steps_leave_gaussians_out_from_the_second_part_on_but_not_the_last_of_a_part(
         dropout: 0.25,
         gain_min: f64::MIN,
         overfit_further: f32::MAX,
+        pose_rate: 0.0,
         ..steps_of(160, 40)
     };
     assert_eq!(refined_whole(&renderer, &photos, &options, &|| ()).found.versions, 2);
