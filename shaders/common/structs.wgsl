@@ -85,8 +85,8 @@ struct View {
     block_count: u32,
     // How far a Gaussian may be from the merged one that stands for it, for each unit of depth.
     detail: f32,
-    // Gaussians that are left out by chance: the chance in the upper 8 bits, in steps of 1/256, and a
-    // seed; 0: none.
+    // Gaussians that are left out by chance: the chance in the upper 8 bits, in steps of 1/256, and
+    // a seed; 0: none.
     dropout: u32,
 }
 

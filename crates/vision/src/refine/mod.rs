@@ -152,8 +152,7 @@ pub struct RefineOptions {
     pub ssim_share: f32,
     /// Chance of each Gaussian to be left out of a step, but not of the last ones
     /// ([`segsplat_render::Dropout`]); of [`crate::pipeline::refinement::refined`] from the second
-    /// part on. Chosen on computer_mouse, juice_box_table, sceaux_castle, terrace and
-    /// wooden_sculpture: docs/adr/0110.
+    /// part on. Chosen on the five scenes that docs/adr/0110 names.
     pub dropout: f32,
     /// How far cameras turn in a step at first, radians, and move, as a share of the scene's median
     /// depth; 0: they stay where they are.
