@@ -237,7 +237,7 @@ def main():
 licence = "Apache-2.0"
 source = "Depth Anything 3 {args.variant} (PyPI depth-anything-3 0.1.1), {weights_of(args)}"
 input = "images"
-extrinsics = "extrinsics"
+world_to_camera = "extrinsics"
 intrinsics = "intrinsics"
 {depths}views_max = {VIEWS_MAX}
 side = {SIDE}

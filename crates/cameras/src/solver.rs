@@ -36,8 +36,8 @@ const LINK_INLIERS_MIN: usize = 15;
 const FINISH_ROUNDS: usize = 4;
 const FINISH_GAIN: f64 = 1.01;
 const KEPT_SHARE: f64 = 0.95;
-/// How far off the keypoints of a guess may be, turn by turn, in distances at which keypoints agree:
-/// the first is some three degrees.
+/// How far off the keypoints of a guess may be, turn by turn, in distances at which keypoints
+/// agree: the first is some three degrees.
 const GUESS_OFF: [f64; 4] = [16.0, 8.0, 4.0, 2.0];
 const GUESS_STEPS: usize = 12;
 
@@ -293,8 +293,8 @@ fn grow_from_pairs(
     grown
 }
 
-/// The solution that a guess leads to: its cameras go where the matches near them say, and what they
-/// do not hold is placed as in any other.
+/// The solution that a guess leads to: its cameras go where the matches near them say, and what
+/// they do not hold is placed as in any other.
 fn from_guess(
     survey: &Survey,
     guess: &Guess,

@@ -106,7 +106,7 @@ impl CameraNetwork {
     }
 
     fn names(&self) -> [&str; 2] {
-        [&self.manifest.extrinsics, &self.manifest.intrinsics]
+        [&self.manifest.world_to_camera, &self.manifest.intrinsics]
     }
 
     /// The photos that the network sees, in their order.
@@ -123,9 +123,10 @@ impl CameraNetwork {
     }
 
     fn read(&self, outputs: &dyn Outputs, photos: &[&Photo]) -> Result<Vec<Camera>> {
-        let names @ [extrinsics, intrinsics] = self.names();
+        let names @ [world_to_camera, intrinsics] = self.names();
         let views = photos.len();
-        let ((of, poses), (sizes, lenses)) = (outputs.get(extrinsics)?, outputs.get(intrinsics)?);
+        let ((of, poses), (sizes, lenses)) =
+            (outputs.get(world_to_camera)?, outputs.get(intrinsics)?);
         if of != [views, 3, 4] || sizes != [views, 3, 3] {
             return Err(Error::internal(format!(
                 "{CAMERAS}: {names:?} are {of:?} and {sizes:?}, not [{views}, 3, 4] and [{views}, \
@@ -149,7 +150,7 @@ fn camera_of(pose: &[f32; 12], lens: &[f32; 9], size: [u32; 2], photo: &Photo) -
     let mut rows = [0.0; 16];
     rows.iter_mut().zip(pose).for_each(|(row, value)| *row = f64::from(*value));
     rows[15] = 1.0;
-    let world_to_camera = CameraToWorld::from_row_major(&rows, "extrinsics")?;
+    let world_to_camera = CameraToWorld::from_row_major(&rows, "world_to_camera")?;
     let turn = world_to_camera.rotation().transpose();
     let center = -(turn * world_to_camera.center());
     let [fx, fy, cx, cy] = [0, 4, 2, 5].map(|at| f64::from(lens[at]));
@@ -206,7 +207,7 @@ fn signature<'a>(manifest: &'a CamerasManifest) -> Vec<Wanted<'a>> {
     let most = [manifest.views_max, 3, side, side];
     [
         Wanted::new(Side::Input, &manifest.input, pictures).at_most(&most),
-        Wanted::new(Side::Output, &manifest.extrinsics, rows(4)),
+        Wanted::new(Side::Output, &manifest.world_to_camera, rows(4)),
         Wanted::new(Side::Output, &manifest.intrinsics, rows(3)),
     ]
     .into_iter()

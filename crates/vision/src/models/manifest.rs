@@ -782,7 +782,7 @@ pub struct CamerasManifest {
     /// Input: `[V, 3, H, W]` f32, photos of one shape.
     pub input: String,
     /// Output: `[V, 3, 4]` f32, world to camera, of one world and scale.
-    pub extrinsics: String,
+    pub world_to_camera: String,
     /// Output: `[V, 3, 3]` f32, pixels of the input.
     pub intrinsics: String,
     /// Output: `[V, H, W]` f32, depths in the scale of the cameras; absent where the network gives

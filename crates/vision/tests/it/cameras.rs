@@ -19,8 +19,8 @@ use crate::network_options;
 
 const MANIFEST: &str = "bundle.toml";
 /// The hashes of both networks.
-const NEAR: &str = "3c9f020484252658d210c30a3b96c3262cec80128d0ed69452bd5824e42ab235";
-const WRONG: &str = "616e3dd0c735c4902af91d8aa452fe3fd7b054c82f902df6687cfea1f80bc9d5";
+const NEAR: &str = "634c6efd8882b68bdccf1d2f08568602408426b309200097f7bef6667d358f02";
+const WRONG: &str = "15faa931328402efa6779e4044e1e570d1507d0740f2c3538d9103d588c4d922";
 
 /// The embedded bundle with the section and both networks of the fixture.
 fn bundle() -> TempDir {
@@ -113,15 +113,15 @@ fn the_section_is_checked_and_what_does_not_fit_is_named() {
     let files = files.files();
     assert!(files.iter().any(|of| of.part == "cameras" && of.file == "near.onnx"), "{files:?}");
 
-    replace(&dir, "extrinsics = \"extrinsics\"", "extrinsics = \"poses\"");
+    replace(&dir, "world_to_camera = \"world_to_camera\"", "world_to_camera = \"poses\"");
     assert!(faults(&dir).contains("near.onnx has no output \"poses\""), "{}", faults(&dir));
-    replace(&dir, "extrinsics = \"poses\"", "extrinsics = \"intrinsics\"");
+    replace(&dir, "world_to_camera = \"poses\"", "world_to_camera = \"intrinsics\"");
     let said = faults(&dir);
     assert!(
         said.contains("output \"intrinsics\" is Float32 [-1, 3, 3], not f32 [2..8, 3, 4]"),
         "{said}"
     );
-    replace(&dir, "extrinsics = \"intrinsics\"", "extrinsics = \"extrinsics\"");
+    replace(&dir, "world_to_camera = \"intrinsics\"", "world_to_camera = \"world_to_camera\"");
     replace(&dir, "views_max = 8", "views_max = 1");
     let error = bundle_of(&dir).unwrap_err();
     assert_eq!(error.code(), ErrorCode::ModelUnavailable);
