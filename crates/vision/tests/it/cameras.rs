@@ -22,19 +22,30 @@ const MANIFEST: &str = "bundle.toml";
 const NEAR: &str = "634c6efd8882b68bdccf1d2f08568602408426b309200097f7bef6667d358f02";
 const WRONG: &str = "15faa931328402efa6779e4044e1e570d1507d0740f2c3538d9103d588c4d922";
 
-/// The embedded bundle with the section and both networks of the fixture.
+/// The bundle of colours with the networks of keypoints of the product, and the section and both
+/// networks of the fixture.
 fn bundle() -> TempDir {
     let dir = tempfile::tempdir().unwrap();
-    for from in ["models/embedded", "tests/fixtures/cameras"].map(|folder| root().join(folder)) {
-        for entry in std::fs::read_dir(from).unwrap() {
-            let entry = entry.unwrap();
-            std::fs::copy(entry.path(), dir.path().join(entry.file_name())).unwrap();
-        }
+    let folders = ["models/embedded", "tests/fixtures/colours", "tests/fixtures/cameras"];
+    let [product, folders @ ..] = folders.map(|folder| root().join(folder));
+    for entry in folders.iter().flat_map(|from| std::fs::read_dir(from).unwrap()) {
+        let entry = entry.unwrap();
+        std::fs::copy(entry.path(), dir.path().join(entry.file_name())).unwrap();
+    }
+    for file in ["features.onnx", "matcher.onnx"] {
+        std::fs::copy(product.join(file), dir.path().join(file)).unwrap();
     }
     let read = |file: &str| std::fs::read_to_string(dir.path().join(file)).unwrap();
-    let manifest = read(MANIFEST) + &read("cameras.toml");
+    let of_product = std::fs::read_to_string(product.join(MANIFEST)).unwrap();
+    let sections = of_product.split("\n[").filter(|of| is_of_keypoints(of));
+    let sections: String = sections.map(|section| format!("\n[{section}\n")).collect();
+    let manifest = read(MANIFEST) + &sections + &read("cameras.toml");
     std::fs::write(dir.path().join(MANIFEST), manifest).unwrap();
     dir
+}
+
+fn is_of_keypoints(section: &str) -> bool {
+    section.starts_with("features]") || section.starts_with("matcher]")
 }
 
 fn replace(dir: &TempDir, old: &str, new: &str) {
@@ -118,7 +129,7 @@ fn the_section_is_checked_and_what_does_not_fit_is_named() {
     replace(&dir, "world_to_camera = \"poses\"", "world_to_camera = \"intrinsics\"");
     let said = faults(&dir);
     assert!(
-        said.contains("output \"intrinsics\" is Float32 [-1, 3, 3], not f32 [2..8, 3, 4]"),
+        said.contains("output \"intrinsics\" is f32 [-1, 3, 3], not f32 [2..8, 3, 4]"),
         "{said}"
     );
     replace(&dir, "world_to_camera = \"intrinsics\"", "world_to_camera = \"world_to_camera\"");
@@ -143,9 +154,7 @@ fn a_bundle_with_it_needs_the_network_of_keypoints() {
     let dir = bundle();
     let path = dir.path().join(MANIFEST);
     let text = std::fs::read_to_string(&path).unwrap();
-    let sections = text
-        .split("\n[")
-        .filter(|section| !section.starts_with("features]") && !section.starts_with("matcher]"));
+    let sections = text.split("\n[").filter(|section| !is_of_keypoints(section));
     std::fs::write(&path, sections.collect::<Vec<_>>().join("\n[")).unwrap();
     let error = Bundle::open(dir.path()).unwrap_err();
     assert!(error.message().contains("have the section [features] beside it"), "{error}");
