@@ -6,8 +6,9 @@ use std::{path::Path, time::Instant};
 use crate::{
     error::Result,
     models::{
-        Bundle, FeatureNetwork, Geometry, ImageText, MaskNetwork, MatcherNetwork, NetworkOptions,
-        ProviderChoice, Runtime, TextMaskNetwork, features, geometry, image_text, masks, matcher,
+        Bundle, CameraNetwork, FeatureNetwork, Geometry, ImageText, MaskNetwork, MatcherNetwork,
+        NetworkOptions, ProviderChoice, Runtime, TextMaskNetwork, cameras, features, geometry,
+        image_text, masks, matcher,
         network::{self, Signature},
         onnx::OnnxHeader,
         text_masks,
@@ -132,6 +133,14 @@ pub fn check(dir: &Path, options: &NetworkOptions) -> Result<BundleCheck> {
                     )
                 });
             }
+        }
+        if let Some(manifest) = bundle.cameras() {
+            run("cameras", &cameras::signatures(manifest), &|| {
+                timed(
+                    || CameraNetwork::open(runtime, &bundle, options),
+                    |of| of.as_ref().map_or(Ok(()), CameraNetwork::try_out),
+                )
+            });
         }
     }
     let name = format!("{} {}", bundle.name(), bundle.version());
