@@ -282,6 +282,7 @@ def _models(fields: dict[str, Any]) -> dict[str, Any]:
 
 def _event(fields: dict[str, Any]) -> dict[str, Any]:
     event = fields["state"] if fields["version"] is None else "version"
+    event = event if fields["edits"] is None else "edited"
     return {**fields, **(fields["error"] or {}), "event": event}
 
 
