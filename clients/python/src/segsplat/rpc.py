@@ -165,7 +165,7 @@ def _nested(method: str, fields: dict[str, Any]) -> dict[str, Any]:
         thing = dict(rest.pop("thing"))
         side = {"side": _enum("box_side", thing.pop("side"))} if "side" in thing else {}
         taken["thing"] = {**thing, **side}
-    if "edits" in rest:
+    if method == "SetEdits":
         rest["edits_json"] = json.dumps(rest.pop("edits")).encode()
     if method == "Export":
         rest["format"] = _enum("export_format", rest["format"])
