@@ -9,7 +9,7 @@ use std::{
 
 use parking_lot::{Condvar, Mutex};
 
-use super::{shared::Shared, times::staged};
+use super::{memory::Memory, times::staged};
 use crate::{
     error::{Error, ErrorCode, Result},
     formats::packed::CoarseForms,
@@ -103,15 +103,24 @@ struct Next {
 }
 
 impl Foresight {
-    /// Starts the thread, which ends with [`Self::close`] or with what it works for.
+    /// Starts the thread, which ends with [`Self::close`]. `load` gives a scene as it is served;
+    /// `None` where it is gone, and where nobody serves it any more.
     ///
     /// # Errors
     /// `internal` when it cannot be started.
-    pub(super) fn start(self: &Arc<Self>, shared: Weak<Shared>) -> Result<()> {
+    pub(super) fn start(
+        self: &Arc<Self>,
+        coarse: Arc<LastCoarse>,
+        memory: Arc<Memory>,
+        load: impl Fn(&SceneId) -> Result<Option<Arc<Scene>>> + Send + 'static,
+    ) -> Result<()> {
         let foresight = Arc::clone(self);
         let life = move || {
             while let Some(id) = foresight.take() {
-                let made = AssertUnwindSafe(|| foresight.make(&shared, &id));
+                let made = AssertUnwindSafe(|| match load(&id)? {
+                    Some(scene) => foresight.make(&coarse, &memory, &scene),
+                    None => Ok(()),
+                });
                 let panicked = |_| Err(Error::internal("a panic"));
                 match catch_unwind(made).unwrap_or_else(panicked) {
                     Err(error) if error.code() != ErrorCode::Cancelled => {
@@ -168,22 +177,14 @@ impl Foresight {
         if goes_on { Ok(()) } else { Err(why()) }
     }
 
-    /// Makes the forms of a scene as it is served, where it is large and there is room.
-    fn make(&self, shared: &Weak<Shared>, id: &SceneId) -> Result<()> {
-        let Some(held) = shared.upgrade() else { return Ok(()) };
-        let scene = match held.load_as_served(id) {
-            Err(error) if error.code() == ErrorCode::SceneNotFound => return Ok(()),
-            scene => scene?,
-        };
-        let (coarse, memory) = (Arc::clone(&held.coarse), Arc::clone(&held.memory));
-        // Who stops the service does not wait for this.
-        drop(held);
+    /// Makes the forms of a scene, where it is large and there is room.
+    fn make(&self, coarse: &LastCoarse, memory: &Memory, scene: &Scene) -> Result<()> {
         if scene.gaussians.len() < BLOCKS_MIN {
             return Ok(());
         }
         let bytes = LastCoarse::bytes(&scene.gaussians);
         memory.admit(usize::try_from(bytes).unwrap_or(usize::MAX))?;
-        coarse.of_unless(&scene, &|| self.unless_changed(id)).map(drop)
+        coarse.of_unless(scene, &|| self.unless_changed(&scene.meta.id)).map(drop)
     }
 }
 

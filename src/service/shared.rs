@@ -19,7 +19,7 @@ use crate::{
     keys::Caller,
     limits::{Limits, LiveLimits},
     render::{Renderer, blocks::BLOCKS_MIN},
-    scene::SceneState,
+    scene::{SceneId, SceneState},
     store::{Record, Store, StoreLocation},
 };
 
@@ -185,7 +185,14 @@ impl Service {
             config,
         };
         let inner = Arc::new(inner);
-        inner.foresight.start(Arc::downgrade(&inner))?;
+        let served = Arc::downgrade(&inner);
+        // Who stops the service waits for no more than this.
+        let load = move |id: &SceneId| match served.upgrade().map(|inner| inner.load_as_served(id))
+        {
+            Some(Err(error)) if error.code() == ErrorCode::SceneNotFound => Ok(None),
+            scene => scene.transpose(),
+        };
+        inner.foresight.start(Arc::clone(&inner.coarse), Arc::clone(&inner.memory), load)?;
         // Who comes back after a restart opens the scene that was made last.
         let is_large = |record: &Record| {
             let report = record.status.report.as_ref();

@@ -9,14 +9,14 @@ use segsplat_core::scene::{Camera, Gaussians, Intrinsics, RawGaussians, Region, 
 use segsplat_render::{
     Frame, Labels, Layer, RenderRequest, Renderer, Source, Switches,
     blocks::{BLOCK, Blocks, Frustum},
-    constants::ALPHA_MIN,
+    constants::{ALPHA_MIN, TRANSMITTANCE_MIN},
     cpu::{
         CpuRenderer,
         cull::Shown,
         lanes::KernelOptions,
         project::{Projected, project},
     },
-    oracle::{self, Contribution},
+    oracle::{self, Contribution, Splat},
     view::View,
 };
 use segsplat_testing::{
@@ -228,19 +228,27 @@ fn what_adds_to_a_pixel_is_found_without_projecting_all() {
             let pixel =
                 [lens.width, lens.height].map(|side| (random.bits() % u64::from(side)) as u32);
             let at = DVec2::from(pixel.map(|at| f64::from(at) + 0.5));
-            let adds = |i: &usize| {
-                let splat = oracle::splat(&gaussians, *i, &request, &lens);
-                splat.is_some_and(|splat| splat.alpha(at) >= f64::from(ALPHA_MIN))
+            let adds = |i: usize| {
+                let splat = oracle::splat(&gaussians, i, &request, &lens)?;
+                (splat.alpha(at) >= f64::from(ALPHA_MIN)).then_some((i, splat))
             };
-            let all: Vec<usize> = (0..gaussians.len()).filter(adds).collect();
-            let whole = oracle::contributions(&gaussians, &request, pixel).expect("a pixel");
-            let some = gaussians.only(|i| all.binary_search(&i).is_ok());
-            let alone = oracle::contributions(&some, &request, pixel).expect("a pixel");
-            let alone: Vec<_> = alone
-                .into_iter()
-                .map(|one| Contribution { gaussian: all[one.gaussian], ..one })
-                .collect();
-            assert_eq!(whole, alone, "seed {seed}, {pixel:?}");
+            let mut all: Vec<(usize, Splat)> = (0..gaussians.len()).filter_map(adds).collect();
+            all.sort_by(|a, b| a.1.order(&b.1));
+            let (mut left, mut wanted) = (1.0, Vec::new());
+            for (gaussian, splat) in &all {
+                let weight = left * splat.alpha(at);
+                left *= 1.0 - splat.alpha(at);
+                if left <= f64::from(TRANSMITTANCE_MIN) {
+                    break;
+                }
+                wanted.push(Contribution { gaussian: *gaussian, depth: splat.depth, weight });
+            }
+            let found = oracle::contributions(&gaussians, &request, pixel).expect("a pixel");
+            assert_eq!(found.len(), wanted.len(), "seed {seed}, {pixel:?}");
+            for (found, wanted) in found.iter().zip(&wanted) {
+                assert_eq!((found.gaussian, found.depth), (wanted.gaussian, wanted.depth));
+                assert!((found.weight - wanted.weight).abs() < 1e-12, "{found:?}, not {wanted:?}");
+            }
             (pixels, adding) = (pixels + usize::from(!all.is_empty()), adding + all.len());
         }
     }
