@@ -32,6 +32,7 @@ pub(crate) struct Variant {
     prune_every: u32,
     opacity_min: f32,
     ssim_share: f32,
+    dropout: f32,
     pose_rate: f32,
     mends_from: f64,
     proof_share: f32,
@@ -66,6 +67,7 @@ impl Default for Variant {
             prune_every: plain.prune_every,
             opacity_min: plain.opacity_min,
             ssim_share: plain.ssim_share,
+            dropout: plain.dropout,
             pose_rate: plain.pose_rate,
             mends_from: plain.mends_from,
             proof_share: plain.proof_share,
@@ -91,6 +93,11 @@ impl Variant {
         if self.layers { (made.clone(), made.gaussians) } else { (made, one_set) }
     }
 
+    /// Time that it was given: without end where it counts steps, so that they are all that counts.
+    fn time(&self) -> Duration {
+        if self.ms < u64::MAX { Duration::from_millis(self.ms) } else { Duration::MAX }
+    }
+
     /// Seconds that it was given; none where it counts steps.
     pub(crate) fn asked_s(&self) -> Option<f64> {
         (self.ms < u64::MAX).then_some(self.ms as f64 / 1e3)
@@ -101,7 +108,7 @@ impl Variant {
         let plain = RefineOptions::default();
         let rates = plain.rates.scaled(self.rate);
         RefineOptions {
-            budget: RefineBudget { steps: self.steps, time: Duration::from_millis(self.ms) },
+            budget: RefineBudget { steps: self.steps, time: self.time() },
             batch: self.batch,
             side: self.side,
             rates: LearningRates {
@@ -122,6 +129,7 @@ impl Variant {
             opacity_min: self.opacity_min,
             prune_every: self.prune_every,
             ssim_share: self.ssim_share,
+            dropout: self.dropout,
             pose_rate: self.pose_rate,
             mends_from: self.mends_from,
             proof_share: self.proof_share,
@@ -139,5 +147,18 @@ impl FromStr for Variant {
     fn from_str(text: &str) -> Result<Self> {
         let pairs: Vec<String> = text.split(',').map(str::to_owned).collect();
         with_pairs(&Self::default(), &pairs)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_variant_of_steps_has_no_end_in_time() {
+        let budget = |text: &str| text.parse::<Variant>().expect("a variant").options().budget;
+        assert_eq!(budget("steps=400"), RefineBudget::steps(400));
+        let timed = RefineBudget { steps: u32::MAX, time: Duration::from_millis(5_000) };
+        assert_eq!(budget("ms=5000"), timed);
     }
 }

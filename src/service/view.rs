@@ -91,10 +91,7 @@ impl Resolved {
     /// A request of these pictures of the scene, without labels.
     pub(super) fn request(&self, scene: &Scene, kinds: Kinds) -> RenderRequest {
         RenderRequest {
-            camera: self.camera,
             crop: self.picture.crop,
-            kinds,
-            labels: Labels::None,
             background: match self.picture.background {
                 BackgroundSpec::Backdrop if !self.method.backdrop => render::Background::BLACK,
                 BackgroundSpec::Backdrop => {
@@ -111,9 +108,9 @@ impl Resolved {
                 }
             },
             antialiased: self.options.antialiased.unwrap_or(scene.meta.report.antialiased),
-            near: self.near,
             error: self.options.error.0,
             detail: self.options.detail,
+            ..RenderRequest::plain(self.camera, kinds, self.near)
         }
     }
 

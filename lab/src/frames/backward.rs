@@ -14,7 +14,7 @@ use crate::{
         DifferentiableRenderer, Kinds, RenderRequest,
         backward::{FrameGradients, Gradients},
         cpu::CpuRenderer,
-        train::{LearningRates, PoseRates, TrainingPhoto, TrainingSet, TrainingStep},
+        train::{TrainingPhoto, TrainingSet, TrainingStep},
     },
     rows::{Rows, median, ms},
     scene::{Gaussians, Photo},
@@ -120,9 +120,7 @@ fn trained(
     let streamed = Vec::new();
     let set = TrainingSet { gaussians, photos, streamed, ssim_share, gaussians_max: 0 };
     let Some(mut trainer) = renderer.trainer(&set, u64::MAX)? else { return Ok(None) };
-    let rates = LearningRates::default();
-    let step =
-        TrainingStep { rates, exposure: 5e-3, poses: PoseRates::default(), opacity_min: 0.0 };
+    let step = TrainingStep { exposure: 5e-3, ..TrainingStep::default() };
     let mut times = Vec::new();
     for _ in 0..=steps {
         let begun = Instant::now();

@@ -27,8 +27,8 @@ use crate::{
     error::{Error, Result},
     scene::{CameraToWorld, Gaussians, Photo, RawGaussians},
     train::{
-        Exposure, LearningRates, PoseGradient, PoseRates, StreamedPhoto, Trainer, TrainingPhoto,
-        TrainingSet, TrainingStep, absent, adam, checked,
+        Exposure, LearningRates, PoseGradient, StreamedPhoto, Trainer, TrainingPhoto, TrainingSet,
+        TrainingStep, absent, adam, checked,
         growth::{Origins, halves, most_blamed},
         pose::Pose,
     },
@@ -296,6 +296,7 @@ impl DeviceTrainer {
         let PhotoStep { at, step, adds, moves, blames } = photo_step;
         let mut target = self.targets.get(at).ok_or_else(|| absent(at))?.clone();
         target.request.camera.camera_to_world = self.poses[target.pose].now;
+        target.request.dropout = step.dropout;
         if let Some(photo) = &target.streamed {
             let pixels = rgba_of(&photo.read()?);
             let (to, at) = (&self.training.photos, 4 * u64::from(target.start));
@@ -381,10 +382,9 @@ impl DeviceTrainer {
     /// How much each place is to blame for how the scene differs from the photos.
     fn blame(&mut self, photos: &[usize]) -> Result<Vec<f32>> {
         let earlier = self.earlier()?;
-        // Nothing moves.
+        // Nothing moves, and all are blamed.
         let rates = LearningRates::default().scaled(0.0);
-        let poses = PoseRates::default();
-        let step = TrainingStep { rates, exposure: 0.0, poses, opacity_min: 0.0 };
+        let step = TrainingStep { rates, ..TrainingStep::default() };
         for (place, &at) in photos.iter().enumerate() {
             self.take(PhotoStep { at, step, adds: place > 0, moves: false, blames: true })?;
         }

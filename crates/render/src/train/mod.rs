@@ -25,7 +25,7 @@ pub use self::{
     streamed::{PhotoSource, StreamedPhoto},
 };
 use crate::{
-    Frame, RenderRequest,
+    Dropout, Frame, RenderRequest,
     error::{Error, Result},
     scene::{CameraToWorld, Gaussians, Photo},
 };
@@ -101,7 +101,7 @@ impl TrainingSet<'_> {
 }
 
 /// How a step moves what it moves.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TrainingStep {
     /// How far numbers of Gaussians move.
     pub rates: LearningRates,
@@ -111,6 +111,9 @@ pub struct TrainingStep {
     pub poses: PoseRates,
     /// Gaussians under this opacity are dropped after the step; 0 drops none.
     pub opacity_min: f32,
+    /// Gaussians that the step leaves out: it neither draws nor moves them. Their numbers are those
+    /// of [`Trainer::gaussians`] until some are dropped or added; then each trainer has its own.
+    pub dropout: Dropout,
 }
 
 /// A place where steps are taken. Twins: from the same start they come to the same numbers, to the

@@ -11,10 +11,7 @@ use segsplat_core::{
 use segsplat_render::{
     DifferentiableRenderer, Frame, Kinds, RenderRequest, Renderer,
     backward::{FrameGradients, Gradients},
-    train::{
-        HostTrainer, LearningRates, PoseRates, Trainer as _, TrainingPhoto, TrainingSet,
-        TrainingStep,
-    },
+    train::{HostTrainer, LearningRates, Trainer as _, TrainingPhoto, TrainingSet, TrainingStep},
 };
 use segsplat_testing::scenes::{Random, camera, checked, push, request};
 
@@ -144,8 +141,7 @@ fn steps_are_those_of_pytorch() {
         sh: 2.5e-3,
         sh_rest: 1.25e-4,
     };
-    let step =
-        TrainingStep { rates, exposure: 5e-3, poses: PoseRates::default(), opacity_min: 0.0 };
+    let step = TrainingStep { rates, exposure: 5e-3, ..TrainingStep::default() };
     for _ in 0..STEPS {
         trainer.step(&[0], &step).expect("a step");
     }
