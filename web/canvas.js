@@ -31,6 +31,7 @@ function frame() {
     Math.max(1, Math.round(box.height * scale)),
   );
   if (drawing.sort(state.camera, moving)) drawing.draw(state.camera, state.kind);
+  if (moving) Object.assign(holes, { of: '', picture: null });
   over(box.width, box.height);
   const settled =
     drawing.settled &&
@@ -38,6 +39,8 @@ function frame() {
     drawing.loaded === drawing.count &&
     drawing.sortKnown === drawing.count;
   $('view').dataset.state = settled ? 'settled' : 'busy';
+  if (settled && state.holes && !$('holes').hidden)
+    seeHoles(Math.round(box.width), Math.round(box.height)).catch(failed);
   if (moving) invalidate();
 }
 
@@ -51,6 +54,8 @@ function over(width, height) {
   canvas.height = height * dense;
   pen.clearRect(0, 0, canvas.width, canvas.height); // not every device clears by the size alone
   pen.scale(dense, dense);
+  if (state.holes && !$('holes').hidden && holes.picture)
+    pen.drawImage(holes.picture, 0, 0, width, height);
   const { camera, scene } = state,
     [x, y, z] = axesOf(camera),
     focal = focalOf(camera, height);

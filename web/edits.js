@@ -10,6 +10,7 @@ const edits = {
   work: Promise.resolve(),
   forget() {
     Object.assign(this, { list: [], counts: [], uncovered: 0, past: [], future: [] });
+    Object.assign(holes, { of: '', picture: null });
     choose(null);
     showEdits();
   },
@@ -126,6 +127,7 @@ function showEdits() {
   $('edits').replaceChildren(...rows);
   $('edits-none').hidden = list.length > 0;
   $('edits-count').textContent = list.length ? count(list.length) : '';
+  $('holes').hidden = edits.uncovered < HOLE;
   $('undo').disabled = !list.length && !edits.past.length;
   $('redo').disabled = !edits.future.length;
   if (!focused) return;
@@ -136,6 +138,38 @@ function showEdits() {
   focusOn = null;
 }
 let focusOn = null; // the row to which the pressed one goes
+
+// ---- holes --------------------------------------------------------------------------------------
+// Stripes over what edits uncovered and no photo saw, as the server says of the view at rest.
+const holes = { of: '', picture: null };
+async function seeHoles(width, height) {
+  const asked = new URLSearchParams({
+    kind: 'holes',
+    format: 'png',
+    camera_to_world: matrixOf(state.camera),
+    fx: focalOf(state.camera, height),
+    width,
+    height,
+  });
+  const of = `${state.scene.id}/view?${asked}#${edits.turn}`;
+  if (of === holes.of) return;
+  Object.assign(holes, { of, picture: null });
+  const answer = await server.call(`/v1/scenes/${of}`);
+  const seen = await createImageBitmap(await answer.blob()),
+    picture = make('canvas', { width, height }),
+    pen = picture.getContext('2d');
+  pen.drawImage(seen, 0, 0);
+  const cells = pen.getImageData(0, 0, width, height),
+    { data } = cells;
+  for (let i = 0; i < data.length / 4; i++) {
+    const striped = ((i % width) + Math.floor(i / width)) & 8;
+    data.set([255, 0, 255, striped ? data[4 * i] : 0], 4 * i);
+  }
+  pen.putImageData(cells, 0, 0);
+  if (of !== holes.of) return;
+  holes.picture = picture;
+  invalidate();
+}
 
 // ---- what is chosen -----------------------------------------------------------------------------
 // A word, all of it or one of its parts, or the thing that was clicked.
@@ -293,6 +327,7 @@ function actNoMore() {
 function bindEdits() {
   $('undo').onclick = ready(undo);
   $('redo').onclick = ready(redo);
+  $('holes').onclick = ready(() => press('holes', 'holes'));
   $('edit-box').onclick = ready(chooseBox);
   $('edit-floaters').onclick = ready(() =>
     edit((now) => [...now, { op: 'delete', select: { floaters: true } }]),
@@ -320,7 +355,7 @@ function bindEdits() {
     act('recolor', { color, amount: Number($('amount').value) });
   };
   document.addEventListener('visibilitychange', () => {
-    if (!document.hidden && state.scene && !state.alone) lookAgain();
+    if (state.scene) keepUp();
   });
   addEventListener('keydown', (e) => {
     if (e.target.matches('input, textarea, select') || !state.scene || state.alone) return;

@@ -1,9 +1,11 @@
 // The scenes of the server: their list, small pictures, opening, better versions, deletion.
 const MOMENT = { dateStyle: 'medium', timeStyle: 'short' },
   SMALL = 200, // pixels across of a small picture
+  AGAIN_MS = 5000, // until a server that ended its events is asked again
   COMPARED = 1 << 20; // Gaussians of a version that is kept to be compared with
 let loading = null,
-  watching = null;
+  watching = null,
+  following = null;
 
 // ---- the list ---------------------------------------------------------------------------------
 async function list(after) {
@@ -157,7 +159,7 @@ async function deleteScene(id) {
 
 // Shows no scene.
 function close() {
-  for (const work of [watching, loading, state.filming]) work?.abort();
+  for (const work of [watching, loading, following, state.filming]) work?.abort();
   forget();
   Object.assign(state, { scene: null, camera: null, home: null });
   mayJoin(false);
@@ -176,6 +178,7 @@ function progress(event) {
 
 // Opens a scene: waits for one that is being made, then loads and shows it.
 async function open(id, camera, words = []) {
+  following?.abort();
   watching?.abort();
   watching = new AbortController();
   const { signal } = watching;
@@ -206,7 +209,7 @@ async function open(id, camera, words = []) {
   about(scene);
   await readEdits(id);
   readScale(id);
-  if (isGrowing) followVersions(id, scene.version, signal).catch(() => {});
+  keepUp();
   for (const b of $('scenes').querySelectorAll('button[data-id]'))
     b.setAttribute('aria-current', String(b.dataset.id === id));
   for (const word of words) await find(word);
@@ -294,29 +297,50 @@ const versions = {
   },
 };
 
-// Shows the better versions of a scene that is refined, after the one of the number `shown`.
-async function followVersions(id, shown, signal) {
-  let newest = shown,
+// Shows better versions and what others edit, while it is seen: browsers have few connections.
+function keepUp() {
+  following?.abort();
+  if (!state.scene || state.alone || document.hidden) return;
+  following = new AbortController();
+  keepUpWith(state.scene.id, following.signal).catch(() => {});
+}
+
+async function keepUpWith(id, signal) {
+  let newest = state.version,
     taking = false;
   const takeNewest = async () => {
     if (taking) return;
     taking = true;
-    while (shown < newest && !signal.aborted) {
-      shown = newest;
+    while (state.version < newest && !signal.aborted) {
+      const version = newest;
       await takeVersion(id, signal);
+      if (!signal.aborted) state.version = version;
     }
     taking = false;
   };
   const heard = ({ event, version, fraction }) => {
+    if (event === 'edited') lookAgain();
     if (event !== 'version') return;
     $('gain').hidden = false;
     if (fraction < 1)
       $('gain-says').textContent = t('refining', { share: Math.round(100 * fraction) });
     newest = version;
-    takeNewest().catch(failed);
+    takeNewest().then(learn).catch(failed);
   };
-  await server.watch(id, heard, signal, { versions: true });
-  if (!signal.aborted) about(await server.json(`/v1/scenes/${id}`));
+  // Whether it is being refined.
+  const learn = async () => {
+    const scene = await server.json(`/v1/scenes/${id}`, { signal }),
+      refined = scene.refinement.state === 'running';
+    newest = Math.max(newest, scene.version);
+    if (!refined) about(scene);
+    return refined;
+  };
+  for (;;) {
+    if (!(await learn()) && state.embedded) return;
+    takeNewest().catch(failed);
+    await server.watch(id, heard, signal, { edits: true });
+    await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+  }
 }
 
 // Takes a version in place of the one that is shown.

@@ -63,10 +63,9 @@ const server = {
   },
 
   // Server-sent events of a scene, by fetch: EventSource cannot send a key. Ends when it is made or
-  // will not be; with `versions` it goes on with the better ones of a scene that is refined, with
-  // `semantics` until these are made.
-  async watch(id, event, signal, { versions = false, semantics = false } = {}) {
-    const query = semantics ? '?semantics=true' : '';
+  // will not be; with `semantics` when these are made, with `edits` when it is deleted.
+  async watch(id, event, signal, { edits = false, semantics = false } = {}) {
+    const query = edits ? '?edits=true' : semantics ? '?semantics=true' : '';
     const answer = await this.call(`/v1/scenes/${id}/events${query}`, { signal });
     const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
     let text = '';
@@ -82,7 +81,7 @@ const server = {
         const told = JSON.parse(data.map((line) => line.slice(5)).join('\n'));
         event(told);
         const over = ['done', 'failed', 'cancelled'].includes(told.event);
-        if (over && !versions && !semantics) return reader.cancel();
+        if (over && !edits && !semantics) return reader.cancel();
       }
     }
   },

@@ -43,6 +43,7 @@ const state = {
   // What the server says of metres, up and ground; whether the ground is shown.
   scale: null,
   ground: false,
+  holes: false,
   upright: null,
   filming: null,
   vr: null,

@@ -385,6 +385,7 @@ const TABLE = {
     'Was dahinter war, ist auf keinem Foto: {share} % der Fotos zeigen dort nun nichts.',
     '其后方未被拍到：照片中有 {share} % 现在没有内容。',
   ],
+  holes: ['Holes', 'Löcher', '空洞'],
   'edits.box': ['Box', 'Quader', '框'],
   'edits.floaters': ['Clean', 'Säubern', '清理'],
   'edits.floaters.title': [

@@ -13,7 +13,7 @@ use serde_json::json;
 
 use self::{
     compared::{Compared, number},
-    hidden::Solved,
+    hidden::{Guess, Solved},
 };
 use crate::{
     error::{Error, Result},
@@ -35,6 +35,8 @@ pub(crate) struct Args {
     /// spread evenly over it
     #[arg(long)]
     neighbours: bool,
+    #[command(flatten)]
+    guess: Guess,
 }
 
 /// Makes a row for each scene with enough photos.
@@ -49,7 +51,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             progress(&format!("{name}: fewer than {} photos", args.inputs.photos));
             continue;
         };
-        let solved = Solved::new(&engine, &capture.upload, &capture.cameras)?;
+        let solved = Solved::new(&engine, &capture.upload, &capture.cameras, &args.guess)?;
         let (outcome, confidence) = (solved.outcome(), solved.found.confidence);
         *outcomes.entry(outcome).or_default() += 1;
         let Compared { placed, rotation_deg, focal, .. } = solved.compared;

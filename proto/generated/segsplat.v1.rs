@@ -1133,6 +1133,10 @@ pub struct WatchSceneRequest {
     /// sees all of its stages.
     #[prost(bool, tag = "2")]
     pub semantics: bool,
+    /// Go on until the scene is deleted: its list of edits is told first, and each time that it is
+    /// another one, whoever changed it.
+    #[prost(bool, tag = "3")]
+    pub edits: bool,
 }
 /// What happens to a scene. DONE, FAILED and CANCELLED are last events. Semantics that are being
 /// made while the scene can be viewed already show as RUNNING with their stage.
@@ -1157,6 +1161,9 @@ pub struct SceneEvent {
     /// refinement's time that is spent. The first event of a scene that is done has none.
     #[prost(uint32, optional, tag = "6")]
     pub version: ::core::option::Option<u32>,
+    /// When the list of edits is told: how many edits it has.
+    #[prost(uint64, optional, tag = "7")]
+    pub edits: ::core::option::Option<u64>,
 }
 /// Which scene.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -2191,6 +2198,9 @@ pub enum Kind {
     Relevancy = 5,
     /// Mask of a text, 0 or 255.
     Mask = 6,
+    /// What edits uncovered and nothing fills, 0..1: the alpha without the edits that is not there
+    /// with them. 0 where there are none.
+    Holes = 7,
 }
 impl Kind {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -2206,6 +2216,7 @@ impl Kind {
             Self::Semantics => "KIND_SEMANTICS",
             Self::Relevancy => "KIND_RELEVANCY",
             Self::Mask => "KIND_MASK",
+            Self::Holes => "KIND_HOLES",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -2218,6 +2229,7 @@ impl Kind {
             "KIND_SEMANTICS" => Some(Self::Semantics),
             "KIND_RELEVANCY" => Some(Self::Relevancy),
             "KIND_MASK" => Some(Self::Mask),
+            "KIND_HOLES" => Some(Self::Holes),
             _ => None,
         }
     }

@@ -68,6 +68,7 @@ pub fn models_info(bundle: &Bundle, execution_provider: &str) -> Result<ModelsIn
             "text_masks.image" => {
                 (1, bundle.text_masks().map(|m| [m.size; 2]).into_iter().collect())
             }
+            "cameras" => (bundle.cameras().map_or(0, |m| m.views_max), Vec::new()),
             _ => (0, Vec::new()),
         };
         ModelInfo {

@@ -80,7 +80,11 @@ fn table(found: &BundleCheck) -> String {
     for file in &found.files {
         let mib = file.bytes as f64 / f64::from(1 << 20);
         let opset = file.opset.map(|n| format!("opset {n}")).unwrap_or_default();
-        let fits = if file.fits { "ok" } else { "WRONG" };
+        let fits = match (file.fits, file.doubles) {
+            (false, _) => "WRONG",
+            (true, 0) => "ok",
+            (true, _) => "ok, but has 64-bit floats: WebGPU does not open it",
+        };
         let (part, name) = (file.part, &file.file);
         let _ = writeln!(text, "  {part:20} {name:28} {mib:9.2} MiB  {opset:8}  {fits}");
     }
@@ -98,7 +102,7 @@ fn as_json(found: &BundleCheck) -> serde_json::Value {
     let files = found.files.iter().map(|file| {
         json!({
             "part": file.part, "file": file.file, "bytes": file.bytes, "opset": file.opset,
-            "fits": file.fits,
+            "doubles": file.doubles, "fits": file.fits,
         })
     });
     let ran = found

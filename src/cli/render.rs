@@ -33,7 +33,7 @@ pub(super) struct Args {
     options: ViewOptions,
     #[command(flatten)]
     picture: PictureOptions,
-    /// What to draw: color, depth, alpha, semantics, relevancy or mask
+    /// What to draw: color, depth, alpha, semantics, relevancy or mask; a file has no holes
     #[arg(long, default_value = "color", value_parser = named::<PictureKind>)]
     kind: PictureKind,
     #[command(flatten)]

@@ -319,6 +319,7 @@ impl Jobs {
             self.queue.push(REFINE, id.clone(), grown.owner.as_deref());
         }
         self.prepare(&scene);
+        (self.parts.foresee)(id);
         Ok(())
     }
 

@@ -256,6 +256,7 @@ impl Jobs {
         let published = self.records.apply(id, &Change::Published(&scene))?.after;
         let psnr = version.report.psnr_after;
         tracing::info!(scene = %id, version = published.status.version, psnr, "refined");
+        (self.parts.foresee)(id);
         Ok(())
     }
 

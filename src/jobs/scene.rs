@@ -288,8 +288,7 @@ impl Jobs {
         }
         self.prepare(scene);
         self.drop_upload_unless_needed(id);
-        // Last: a large scene's takes seconds, and who reads it before then waits for the same.
-        (self.parts.foresee)(scene);
+        (self.parts.foresee)(id);
         Ok(())
     }
 

@@ -29,7 +29,7 @@ use crate::{
     error::{Error, ErrorCode, Result},
     limits::LiveLimits,
     render::Renderer,
-    scene::{Refine, Scene, SceneId, SceneOptions, SemanticsMode, SemanticsState, Stage, Watch},
+    scene::{Refine, SceneId, SceneOptions, SemanticsMode, SemanticsState, Stage, Watch},
     store::{Record, Store, not_found},
 };
 
@@ -121,8 +121,8 @@ pub(crate) struct JobParts {
     pub(crate) renderer: Arc<dyn Renderer>,
     /// What refines them.
     pub(crate) refiner: Refiner,
-    /// Makes what the page reads of a scene that is done.
-    pub(crate) foresee: Box<dyn Fn(&Scene) + Send + Sync>,
+    /// Has made what the page reads of a scene that is served as another one now.
+    pub(crate) foresee: Box<dyn Fn(&SceneId) + Send + Sync>,
     /// How long ago a view was drawn, waited or was encoded; `None`: never.
     pub(crate) since_last_view: Box<dyn Fn() -> Option<Duration> + Send + Sync>,
 }

@@ -66,9 +66,25 @@ pub(super) fn layer(frame: &mut Frame, kind: PictureKind) -> Result<Layer<'stati
             .map(|alpha| Layer::Share(alpha.into()))
             .or_else(|| levels.alpha.take().map(Layer::Levels)),
         PictureKind::Mask => mask.take().map(Layer::Levels),
-        PictureKind::Semantics | PictureKind::Relevancy => None,
+        PictureKind::Holes | PictureKind::Semantics | PictureKind::Relevancy => None,
     };
     layer.ok_or_else(|| Error::internal(format!("the renderer gave no {kind}")))
+}
+
+/// What of the opacity of `before` is not there in `after`.
+pub(super) fn holes(before: &Frame, after: &Frame) -> Result<Layer<'static>> {
+    if let (Some(before), Some(after)) = (&before.alpha, &after.alpha) {
+        let less = before.iter().zip(after).map(|(before, after)| (before - after).max(0.0));
+        return Ok(Layer::Share(less.collect()));
+    }
+    match (&before.levels.alpha, &after.levels.alpha) {
+        (Some(before), Some(after)) => {
+            let less =
+                before.iter().zip(after).map(|(before, after)| before.saturating_sub(*after));
+            Ok(Layer::Levels(less.collect()))
+        }
+        _ => Err(Error::internal("the renderer gave no alpha to compare")),
+    }
 }
 
 /// Refuses pairs of kind and format that would lose the picture, or that have other samples.
@@ -83,7 +99,7 @@ pub(super) fn check(kind: PictureKind, format: Format) -> Result<()> {
             refused("does not survive JPEG: ask for png, webp or npy")
         }
         (
-            PictureKind::Alpha | PictureKind::Relevancy | PictureKind::Mask,
+            PictureKind::Alpha | PictureKind::Holes | PictureKind::Relevancy | PictureKind::Mask,
             Format::Rgb8 | Format::Rgba8,
         ) => refused("has one sample a pixel: ask for grey8"),
         (PictureKind::Semantics, Format::Rgba8) => refused("has no alpha: ask for rgb8"),

@@ -51,6 +51,7 @@ pub use self::{
         ViewsSpec,
     },
     scale::{BoxSide, Measured, ScaleSource, ScaleSpec, ScaleThing, SceneScale},
+    scenes::WatchUntil,
     shared::{Parts, Service},
     times::ViewTimes,
     types::{

@@ -4,7 +4,7 @@ use std::{io::Write, sync::Arc};
 
 use super::{
     features, pick, query,
-    request::{FeaturesSpec, PickSpec, QuerySpec, ScoringOptions, ViewSpec},
+    request::{FeaturesSpec, PickSpec, PictureKind, QuerySpec, ScoringOptions, ViewSpec},
     search::{Backend, SceneTexts, ScoringChoice, SemanticScene},
     texts,
     times::ViewTimes,
@@ -79,6 +79,10 @@ impl OfflineService {
     /// # Errors
     /// As there; `semantics_off` where the scene has no semantics.
     pub fn render(&self, scene: &Arc<Scene>, spec: &ViewSpec) -> Result<RenderedView> {
+        if spec.kind == PictureKind::Holes {
+            let why = "kind=holes: a scene file has no edits; ask the server that keeps the scene";
+            return Err(Error::invalid(why));
+        }
         let ask = texts::check_ask(&[spec.kind], &spec.text, &self.limits)?;
         let view = resolve_one(&self.limits, &**scene, spec)?;
         let texts = if spec.kind.needs_semantics() {
@@ -89,7 +93,7 @@ impl OfflineService {
         };
         let times = texts.as_ref().map_or_else(ViewTimes::default, SceneTexts::times);
         let work = &mut Work::default();
-        let mut views = view.draw(&self.backend, scene, texts.as_ref(), times, work)?;
+        let mut views = view.draw(&self.backend, [scene, scene], texts.as_ref(), times, work)?;
         views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
     }
 

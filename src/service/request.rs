@@ -63,6 +63,9 @@ pub enum PictureKind {
     Depth,
     /// Accumulated opacity, 0..1.
     Alpha,
+    /// What edits uncovered and nothing fills, 0..1: the alpha without the edits that is not there
+    /// with them. 0 where there are none.
+    Holes,
     /// A fixed colour for each entry of the semantic bank, black where there is none.
     Semantics,
     /// How well each pixel fits a text, 0..1.

@@ -1,10 +1,11 @@
 //! The records of scenes for callers: look up, list, delete, watch.
 
-use std::sync::Arc;
+use std::{mem, sync::Arc, time::Duration};
 
 use futures_util::{Stream, stream};
+use tokio::sync::{OwnedSemaphorePermit, watch};
 
-use super::{request::PageRequest, shared::Service, tasks, types::Page};
+use super::{access::SceneAccess, request::PageRequest, shared::Service, tasks, types::Page};
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::{
@@ -61,6 +62,7 @@ impl Service {
         let (inner, gone) = (Arc::clone(&self.inner), scene.id().clone());
         let deleted = tasks::blocking(move || inner.jobs.delete(&gone)).await?;
         self.inner.edits.forget(id);
+        self.inner.foresight.forget(id);
         deleted
     }
 
@@ -70,53 +72,33 @@ impl Service {
     /// # Errors
     /// `scene_not_found`.
     pub async fn watch(&self, id: &SceneId) -> Result<impl Stream<Item = Event> + Send + use<>> {
-        self.watch_for(id, false).await
+        self.watch_for(id, WatchUntil::default()).await
     }
 
-    /// As [`Self::watch`]; with `semantics` a scene that is made is watched until its semantics
-    /// are, too. They are begun by the first text, which may come later than this call.
+    /// As [`Self::watch`], for as long as `until` says.
     ///
     /// # Errors
-    /// As [`Self::watch`].
+    /// As [`Self::watch`]; `overloaded` where too many callers are told edits.
     pub async fn watch_for(
         &self,
         id: &SceneId,
-        semantics: bool,
+        until: WatchUntil,
     ) -> Result<impl Stream<Item = Event> + Send + use<>> {
-        let watcher = self.inner.jobs.watch(self.scene(id).await?.id())?;
-        let service = self.clone();
-        let first = Some((service, watcher, semantics, None));
-        Ok(stream::unfold(first, async |state| {
-            let (service, mut watcher, semantics, before) = state?;
-            loop {
-                if before.is_some() {
-                    tokio::select! {
-                        changed = watcher.changed() => changed.ok()?,
-                        () = service.inner.stopped_waiting() => return None,
-                    }
-                }
-                let status = service.shown(watcher.borrow_and_update().status.clone());
-                // Of a scene that waits for its semantics alone there is no other version.
-                let versions = !semantics || status.refinement.state != RefineState::None;
-                let event = match service.event(&status) {
-                    Event::Done if versions && before.as_ref().is_some_and(is_version) => {
-                        let fraction = status.refinement.fraction;
-                        Event::Version { version: status.version, fraction }
-                    }
-                    event => event,
-                };
-                // How far a refinement is, is told with the next version, or with its end.
-                let goes_on = status.is_refined_now()
-                    || semantics && awaits_semantics(&status, before.is_none());
-                if goes_on && before.as_ref().is_some_and(|before| same_version(before, &event)) {
-                    continue;
-                }
-                let last = event.is_last() || is_version(&event);
-                let next =
-                    (!last || goes_on).then(|| (service, watcher, semantics, Some(event.clone())));
-                return Some((event, next));
-            }
-        }))
+        let inner = &self.inner;
+        let place = until.edits.then(|| inner.place_to_watch()).transpose()?;
+        let watcher = Watcher {
+            record: inner.jobs.watch(self.scene(id).await?.id())?,
+            edits: inner.edits.watch(),
+            service: self.clone(),
+            id: id.clone(),
+            until,
+            before: None,
+            refined: false,
+            list: None,
+            over: false,
+            _place: place,
+        };
+        Ok(stream::unfold(watcher, async |mut watcher| Some((watcher.next().await?, watcher))))
     }
 
     fn event(&self, status: &SceneStatus) -> Event {
@@ -151,6 +133,117 @@ impl Service {
                 message: "the reason was not kept".to_owned(),
             })),
         }
+    }
+}
+
+/// How long a scene is watched after it is made.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct WatchUntil {
+    /// Until its semantics are made, too. They are begun by the first text, which may come later
+    /// than the call.
+    pub semantics: bool,
+    /// Until it is deleted, or the caller leaves: each change of its edits is told, and what else
+    /// happens to it.
+    pub edits: bool,
+}
+
+/// One who watches a scene.
+struct Watcher {
+    service: Service,
+    id: SceneId,
+    until: WatchUntil,
+    record: watch::Receiver<Arc<Record>>,
+    /// Rung when the edits of any scene change.
+    edits: watch::Receiver<()>,
+    /// The last event but those of edits.
+    before: Option<Event>,
+    /// Whether the scene was being refined then.
+    refined: bool,
+    /// Hash of the list of edits that was told last.
+    list: Option<String>,
+    over: bool,
+    _place: Option<OwnedSemaphorePermit>,
+}
+
+impl Watcher {
+    async fn next(&mut self) -> Option<Event> {
+        if self.over {
+            return None;
+        }
+        loop {
+            if self.before.is_some() {
+                if let Some(edited) = self.edited().await {
+                    return Some(edited);
+                }
+                if !self.changed().await? {
+                    return self.gone();
+                }
+            }
+            let status = self.record.borrow_and_update().status.clone();
+            let status = self.service.shown(status);
+            let WatchUntil { semantics, edits } = self.until;
+            // Of a scene that waits for its semantics alone there is no other version.
+            let versions = edits || !semantics || status.refinement.state != RefineState::None;
+            let event = match self.service.event(&status) {
+                Event::Done if versions && self.before.as_ref().is_some_and(is_version) => {
+                    let fraction = status.refinement.fraction;
+                    Event::Version { version: status.version, fraction }
+                }
+                event => event,
+            };
+            let goes_on = status.is_refined_now()
+                || edits
+                || semantics && awaits_semantics(&status, self.before.is_none());
+            let refined = mem::replace(&mut self.refined, status.is_refined_now());
+            // How far a refinement is, is told with the next version, or with its end.
+            let ended = edits && refined && !self.refined;
+            let same = |before: &Event| same_version(before, &event) || edits && *before == event;
+            if goes_on && !ended && self.before.as_ref().is_some_and(same) {
+                continue;
+            }
+            self.over = match event {
+                Event::Failed(_) | Event::Cancelled => true,
+                _ => (event.is_last() || is_version(&event)) && !goes_on,
+            };
+            self.before = Some(event.clone());
+            return Some(event);
+        }
+    }
+
+    /// Waits until something may have changed; `None` where the server stops, `false` where the
+    /// scene is gone.
+    async fn changed(&mut self) -> Option<bool> {
+        let inner = &self.service.inner;
+        // Of lists that other replicas put nothing rings.
+        let look_again = self.until.edits && inner.store.is_shared();
+        let fresh = Duration::from_millis(inner.limits().record_fresh_ms.max(1));
+        tokio::select! {
+            changed = self.record.changed() => Some(changed.is_ok()),
+            Ok(()) = self.edits.changed(), if self.until.edits => Some(true),
+            () = tokio::time::sleep(fresh), if look_again => Some(true),
+            () = inner.stopped_waiting() => None,
+        }
+    }
+
+    /// The list of edits, where it is not the one that was told.
+    async fn edited(&mut self) -> Option<Event> {
+        if !self.until.edits {
+            return None;
+        }
+        // What cannot be read now is told when it can.
+        let access = self.service.scene(&self.id).await.and_then(SceneAccess::finished).ok()?;
+        let (list, told) = (access.edits(), self.list.as_deref());
+        if told == Some(list.sha256()) {
+            return None;
+        }
+        self.list = Some(list.sha256().to_owned());
+        Some(Event::Edited { edits: list.len() })
+    }
+
+    /// The end of a scene that was deleted, for who waits for nothing else.
+    fn gone(&mut self) -> Option<Event> {
+        self.over = true;
+        self.until.edits.then_some(Event::Cancelled)
     }
 }
 

@@ -2,10 +2,10 @@
 
 use std::{fmt, sync::Arc};
 
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
 use super::{
-    coarse::LastCoarse,
+    coarse::{Foresight, LastCoarse},
     edits::Edits,
     memory::{Memory, Share},
     schedule::Scheduler,
@@ -14,16 +14,19 @@ use super::{
 };
 use crate::{
     config::Config,
-    error::Result,
+    error::{Error, ErrorCode, Result},
     jobs::{JobParts, Jobs, NetworkState, Refiner, SceneNetworks, SemanticNetworks},
     keys::Caller,
     limits::{Limits, LiveLimits},
-    render::Renderer,
-    store::{Store, StoreLocation},
+    render::{Renderer, blocks::BLOCKS_MIN},
+    scene::{SceneId, SceneState},
+    store::{Record, Store, StoreLocation},
 };
 
 /// Uploads decoded at the same time: each may hold `limits.network_photos_max` photos in memory.
 const UPLOADS_READ_MAX: usize = 2;
+/// When to ask again where too many are told edits, seconds.
+const WATCH_AGAIN_S: u32 = 30;
 /// Locks that calls with one idempotency key share with few others.
 pub(super) const KEY_LOCKS: usize = 16;
 
@@ -72,12 +75,16 @@ pub(super) struct Shared {
     pub(super) reading: Arc<Semaphore>,
     /// Permits to write folders.
     pub(super) folders: Arc<Semaphore>,
+    /// Permits to be told edits.
+    pub(super) watchers: Arc<Semaphore>,
     /// Permits to run networks.
     pub(super) inferences: Arc<Semaphore>,
     pub(super) key_locks: [tokio::sync::Mutex<()>; KEY_LOCKS],
     pub(super) memory: Arc<Memory>,
     /// Of the scene whose packed form was read last.
     pub(super) coarse: Arc<LastCoarse>,
+    /// What makes them before they are read.
+    pub(super) foresight: Arc<Foresight>,
     /// Whether callers who wait for what is being made are answered at once.
     pub(super) stopping: watch::Sender<bool>,
 }
@@ -93,6 +100,15 @@ impl Shared {
         self.limits.get()
     }
 
+    /// One of the places of those who are told edits.
+    pub(super) fn place_to_watch(&self) -> Result<OwnedSemaphorePermit> {
+        Arc::clone(&self.watchers).try_acquire_owned().map_err(|_| {
+            let max = self.config.limits.watchers_max;
+            let why = format!("{max} callers are told edits already, the most that may be");
+            Error::new(ErrorCode::Overloaded, why).retry_after_s(WATCH_AGAIN_S)
+        })
+    }
+
     /// Resolves when nobody waits any more for what is being made.
     pub(super) async fn stopped_waiting(&self) {
         // The sender lives as long as `self`.
@@ -102,6 +118,7 @@ impl Shared {
 
 impl Drop for Shared {
     fn drop(&mut self) {
+        self.foresight.close();
         self.jobs.shut_down();
     }
 }
@@ -122,7 +139,7 @@ impl Service {
         let networks = Arc::clone(&parts.scenes);
         let limits = Arc::new(LiveLimits::new(config.limits.clone()));
         let memory = Arc::new(Memory::new(config.limits.memory_bytes_max));
-        let coarse = Arc::new(LastCoarse::default());
+        let (coarse, foresight) = (Arc::<LastCoarse>::default(), Arc::<Foresight>::default());
         let job_parts = JobParts {
             store: Arc::clone(&store),
             scenes: parts.scenes,
@@ -134,8 +151,8 @@ impl Service {
             renderer: Arc::clone(&parts.renderer),
             refiner,
             foresee: {
-                let (coarse, memory) = (Arc::clone(&coarse), Arc::clone(&memory));
-                Box::new(move |scene| coarse.foresee(scene, &memory))
+                let foresight = Arc::clone(&foresight);
+                Box::new(move |id| foresight.want(id))
             },
             since_last_view: Box::new(move || views.idle()),
         };
@@ -157,15 +174,35 @@ impl Service {
             models,
             reading: Arc::new(Semaphore::new(UPLOADS_READ_MAX)),
             folders: Arc::new(Semaphore::new(config.limits.folder_exports_max)),
+            watchers: Arc::new(Semaphore::new(config.limits.watchers_max)),
             inferences: Arc::new(Semaphore::new(config.limits.inferences_max)),
             key_locks: Default::default(),
             memory,
             coarse,
+            foresight,
             stopping: watch::Sender::default(),
             limits,
             config,
         };
-        Ok(Self { inner: Arc::new(inner), caller: Caller::All })
+        let inner = Arc::new(inner);
+        let served = Arc::downgrade(&inner);
+        // Who stops the service waits for no more than this.
+        let load = move |id: &SceneId| match served.upgrade().map(|inner| inner.load_as_served(id))
+        {
+            Some(Err(error)) if error.code() == ErrorCode::SceneNotFound => Ok(None),
+            scene => scene.transpose(),
+        };
+        inner.foresight.start(Arc::clone(&inner.coarse), Arc::clone(&inner.memory), load)?;
+        // Who comes back after a restart opens the scene that was made last.
+        let is_large = |record: &Record| {
+            let report = record.status.report.as_ref();
+            record.status.state == SceneState::Done
+                && report.is_some_and(|report| report.gaussians >= BLOCKS_MIN as u64)
+        };
+        if let Some(last) = inner.jobs.records.page(None, 1, is_large).0.first() {
+            inner.foresight.want(&last.status.id);
+        }
+        Ok(Self { inner, caller: Caller::All })
     }
 
     /// The same service for another caller.

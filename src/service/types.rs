@@ -367,7 +367,7 @@ pub struct ModelInfo {
     /// What it does: `geometry`, `geometry.cpu`, `geometry.many`, `geometry.many.cpu`,
     /// `masks.encoder`, `masks.decoder`, `image_text.image`, `image_text.text`,
     /// `image_text.tokenizer`, `image_text.words`, `text_masks.image`, `text_masks.find`,
-    /// `text_masks.tokenizer`, `features`, `matcher`.
+    /// `text_masks.tokenizer`, `features`, `matcher`, `cameras`.
     pub name: String,
     /// File in the bundle.
     pub file: String,

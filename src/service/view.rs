@@ -119,8 +119,20 @@ impl Resolved {
         Kinds {
             color: has(PictureKind::Color),
             depth: has(PictureKind::Depth),
-            alpha: has(PictureKind::Alpha),
+            alpha: has(PictureKind::Alpha) || self.has_holes(),
         }
+    }
+
+    /// Whether the scene before its edits is needed.
+    fn has_holes(&self) -> bool {
+        self.kinds.contains(&PictureKind::Holes)
+    }
+
+    /// What edits took of the opacity of this view; `before` is the scene without them.
+    fn holes(&self, backend: &Backend, before: &Scene, after: &Frame) -> Result<Layer<'static>> {
+        let alpha = Kinds { alpha: true, ..Kinds::NONE };
+        let before = backend.renderer.render(&before.gaussians, &self.request(before, alpha))?;
+        encode::holes(&before, after)
     }
 
     /// Hash of scene, renderer and request for one kind; `text` is that of [`text_key`].
@@ -178,17 +190,22 @@ impl Resolved {
         }
     }
 
-    /// The pictures of all kinds; `times` has the stages before.
+    /// The pictures of all kinds; `before` is the scene without its edits, or the same one, and
+    /// `times` has the stages before.
     pub(super) fn draw(
         &self,
         backend: &Backend,
-        scene: &Scene,
+        [before, scene]: [&Scene; 2],
         texts: Option<&SceneTexts>,
         times: ViewTimes,
         work: &mut Work,
     ) -> Result<Vec<RenderedView>> {
-        let (frame, render_ms) = staged("render", || self.frame(backend, scene, texts));
-        let (mut frame, weights) = frame?;
+        let (drawn, render_ms) = staged("render", || {
+            let (frame, weights) = self.frame(backend, scene, texts)?;
+            let holes = self.has_holes().then(|| self.holes(backend, before, &frame));
+            Ok::<_, Error>((frame, weights, holes.transpose()?))
+        });
+        let (mut frame, weights, mut holes) = drawn?;
         work.leave_renderer();
         let name = backend.renderer.name();
         let (width, height, format) = (frame.width, frame.height, self.picture.format);
@@ -207,9 +224,10 @@ impl Resolved {
             if texts.is_none() {
                 times.score_ms = None;
             }
-            let layer = match &scored {
-                Some(scored) => scored.layer(),
-                None => encode::layer(&mut frame, kind)?,
+            let layer = match (&scored, holes.take_if(|_| kind == PictureKind::Holes)) {
+                (Some(scored), _) => scored.layer(),
+                (None, Some(holes)) => holes,
+                (None, None) => encode::layer(&mut frame, kind)?,
             };
             let (encoded, ms) = staged("encode", || encode::encode(layer, width, height, format));
             let encoded = encoded?;
@@ -428,13 +446,18 @@ impl Shared {
         let draw = move |work: &mut Work| match texts {
             Some(texts) => {
                 let scene = &texts.of.scene;
-                view.draw(&inner.backend, scene, Some(&texts), texts.times(), work)
+                let before = match view.has_holes() {
+                    true => inner.load_unedited(&access)?,
+                    false => Arc::clone(scene),
+                };
+                view.draw(&inner.backend, [&before, scene], Some(&texts), texts.times(), work)
             }
             None => {
                 let begun = Instant::now();
-                let scene = inner.load(&access)?;
+                let before = inner.load_unedited(&access)?;
+                let scene = inner.edited(&access, Arc::clone(&before))?;
                 let times = ViewTimes { load_ms: ms(begun), ..ViewTimes::default() };
-                view.draw(&inner.backend, &scene, None, times, work)
+                view.draw(&inner.backend, [&before, &scene], None, times, work)
             }
         };
         let inner = Arc::clone(self);

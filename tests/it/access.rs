@@ -139,7 +139,8 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
                 }
                 "Models" => client.models(pb::ModelsRequest {}).await.map(drop),
                 "WatchScene" => {
-                    let request = pb::WatchSceneRequest { scene_id, semantics: false };
+                    let request =
+                        pb::WatchSceneRequest { scene_id, semantics: false, edits: false };
                     client.watch_scene(request).await.map(drop)
                 }
                 "Pick" => {

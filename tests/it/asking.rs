@@ -19,13 +19,14 @@ use segsplat::{
         Event, Gaussians, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode,
         SemanticsState, Stage, Upload,
     },
-    service::CreateScene,
+    service::{CreateScene, EditSpec, WatchUntil},
 };
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use crate::common::{
     doors::{self, Door},
     meaning::PhotoMeaning,
+    process::eventually,
     server::{
         PATIENCE, PointRenderer, TestServer, WallNetworks, first_view, panicking_upload, upload,
     },
@@ -106,12 +107,26 @@ async fn the_scene_stays_done_while_its_semantics_run_and_watchers_see_their_sta
     assert_eq!(status.semantics.report.unwrap().masks, [1, 1, 1]);
 }
 
-/// What a door tells of a scene and its semantics: `done`, or `STAGE FRACTION`.
+/// What a door tells of a scene until its semantics are there: `done`, or `STAGE FRACTION`.
 async fn told(door: &mut Door, id: &SceneId) -> Pin<Box<dyn Stream<Item = String> + Send>> {
-    match door {
+    told_until(door, id, WatchUntil { semantics: true, edits: false }).await.expect("a stream")
+}
+
+/// The same for as long as is asked, with `edited COUNT`; or the code of what is refused.
+async fn told_until(
+    door: &mut Door,
+    id: &SceneId,
+    WatchUntil { semantics, edits }: WatchUntil,
+) -> std::result::Result<Pin<Box<dyn Stream<Item = String> + Send>>, String> {
+    Ok(match door {
         Door::Http { base, client } => {
-            let events = client.get(format!("{base}/v1/scenes/{id}/events?semantics=true"));
+            let asked = format!("semantics={semantics}&edits={edits}");
+            let events = client.get(format!("{base}/v1/scenes/{id}/events?{asked}"));
             let answer = events.send().await.unwrap();
+            if !answer.status().is_success() {
+                let fault: Value = answer.json().await.unwrap();
+                return Err(fault["code"].as_str().unwrap().to_owned());
+            }
             Box::pin(stream::unfold((answer, String::new()), async |(mut answer, mut text)| {
                 loop {
                     while let Some((event, rest)) = text.split_once("\n\n") {
@@ -128,18 +143,23 @@ async fn told(door: &mut Door, id: &SceneId) -> Pin<Box<dyn Stream<Item = String
             }))
         }
         Door::Grpc { client } => {
-            let request = pb::WatchSceneRequest { scene_id: id.to_string(), semantics: true };
-            let events = client.watch_scene(request).await.unwrap().into_inner();
+            let request = pb::WatchSceneRequest { scene_id: id.to_string(), semantics, edits };
+            let events = match client.watch_scene(request).await {
+                Ok(events) => events.into_inner(),
+                Err(status) => return Err(doors::fault_of(status).code),
+            };
             Box::pin(events.map(|event| {
                 let event = event.unwrap();
                 match event.state() {
+                    _ if event.edits.is_some() => format!("edited {}", event.edits()),
+                    pb::SceneState::Cancelled => "cancelled".to_owned(),
                     pb::SceneState::Running => format!("{} {}", event.stage, event.fraction),
                     pb::SceneState::Done => "done".to_owned(),
                     other => other.as_str_name().to_owned(),
                 }
             }))
         }
-    }
+    })
 }
 
 fn told_by(data: &Value) -> String {
@@ -148,6 +168,7 @@ fn told_by(data: &Value) -> String {
         "running" => {
             format!("{} {}", text("stage"), data["fraction"].as_f64().unwrap() as f32)
         }
+        "edited" => format!("edited {}", data["edits"]),
         other => other.to_owned(),
     }
 }
@@ -195,6 +216,68 @@ async fn events_that_wait_for_semantics_tell_every_stage_of_a_question_that_come
     server.service.understand(&id, Some(PATIENCE)).await.unwrap_err();
     let all = tokio::time::timeout(PATIENCE, events.collect::<Vec<_>>()).await.unwrap();
     assert_eq!(all.last().map(String::as_str), Some("done"), "{all:?}");
+}
+
+/// An edit of so many Gaussians as are around the origin.
+fn delete_within(radius: f64) -> EditSpec {
+    let sphere = json!({ "center": [0, 0, 0], "radius": radius });
+    serde_json::from_value(json!({ "op": "delete", "select": { "sphere": sphere } })).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_asks_for_edits_is_told_each_change_until_the_scene_goes() {
+    let server = TestServer::with(|_, _| {}).await;
+    let until = WatchUntil { semantics: false, edits: true };
+    for mut door in doors::both(server.addr).await {
+        let id = scene(&server, SemanticsMode::Off).await.id;
+        let other = scene(&server, SemanticsMode::Off).await.id;
+        let mut events = told_until(&mut door, &id, until).await.expect("a stream");
+        let mut next = async || {
+            let next = tokio::time::timeout(PATIENCE, events.next()).await;
+            next.expect("something is told in time")
+        };
+        let edit = async |id: &SceneId, edits: &[EditSpec]| {
+            server.service.set_edits(id, edits.to_vec(), None).await.map(drop).unwrap();
+        };
+        assert_eq!(next().await.as_deref(), Some("done"));
+        assert_eq!(next().await.as_deref(), Some("edited 0"), "the list as it is");
+        let [small, large] = [0.01, 0.02].map(delete_within);
+        edit(&id, std::slice::from_ref(&small)).await;
+        assert_eq!(next().await.as_deref(), Some("edited 1"));
+        // The same list, and that of another scene, are nothing new.
+        edit(&id, std::slice::from_ref(&small)).await;
+        edit(&other, &[small.clone(), large.clone()]).await;
+        edit(&id, &[large]).await;
+        assert_eq!(next().await.as_deref(), Some("edited 1"), "another list of one");
+        edit(&id, &[]).await;
+        assert_eq!(next().await.as_deref(), Some("edited 0"));
+        server.service.delete(&id).await.unwrap();
+        assert_eq!(next().await.as_deref(), Some("cancelled"));
+        assert_eq!(next().await, None);
+        server.service.delete(&other).await.unwrap();
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn so_many_are_told_edits_and_no_more_at_a_time() {
+    let server = TestServer::with(|config, _| config.limits.watchers_max = 1).await;
+    let id = scene(&server, SemanticsMode::Off).await.id;
+    let until = WatchUntil { semantics: false, edits: true };
+    let place = async |door: &Door| {
+        let told = async || told_until(&mut door.clone(), &id, until).await.ok();
+        eventually("a place", told).await
+    };
+    for mut door in doors::both(server.addr).await {
+        let mut first = place(&door).await;
+        assert_eq!(first.next().await.as_deref(), Some("done"));
+        let refused = told_until(&mut door, &id, until).await.map(drop).unwrap_err();
+        assert_eq!(refused, "overloaded");
+        let plain = told_until(&mut door, &id, WatchUntil::default()).await.map(drop);
+        plain.expect("who asks for no edits has a stream");
+        drop(first);
+        // Whoever left makes room.
+        drop(place(&door).await);
+    }
 }
 
 async fn told_of(door: &mut Door, id: &SceneId) -> Vec<String> {

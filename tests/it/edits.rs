@@ -129,6 +129,54 @@ async fn an_answer_says_how_much_of_the_photos_shows_nothing_now() {
     assert_eq!(list(&server, &id).await, all, "it is said again");
 }
 
+/// What a view has of each pixel, as numbers.
+async fn layer(server: &TestServer, id: &SceneId, kind: &str) -> Vec<f32> {
+    let url = format!("view?from=0&format=npy&width=64&height=48&kind={kind}");
+    let bytes = get(server, id, &url).await.bytes().await.unwrap();
+    let numbers = &bytes[bytes.len() - 4 * 64 * 48..];
+    numbers.chunks_exact(4).map(|v| f32::from_le_bytes(v.try_into().unwrap())).collect()
+}
+
+#[tokio::test]
+async fn holes_are_where_edits_left_nothing_and_nowhere_else() {
+    let (server, id) = start().await;
+    let none = |holes: &[f32]| holes.iter().all(|v| *v == 0.0);
+    assert!(none(&layer(&server, &id, "holes").await), "without edits");
+    let before = layer(&server, &id, "alpha").await;
+    // The middle of the picture, through all walls: photos saw nothing behind the last one.
+    let url = "pick?from=0&x=32&y=24&width=64&height=48";
+    let seen: Value = get(&server, &id, url).await.json().await.unwrap();
+    let middle = json!({ "center": seen["point"], "radius": 1 });
+    let paint = json!([{ "op": "recolor", "select": { "sphere": middle }, "color": [1, 0, 0] }]);
+    put(&server, &id, paint).await;
+    assert!(none(&layer(&server, &id, "holes").await), "what is painted is there");
+    let sphere = json!({ "center": [900, 0, 0], "radius": 100 });
+    let far = json!({ "op": "copy", "select": { "text": "photo 0" }, "translation": [900, 0, 0] });
+    let mut sizes = Vec::new();
+    for edits in [
+        json!([{ "op": "delete", "select": { "sphere": middle } }]),
+        json!([{ "op": "delete", "select": { "text": "photo 0" } }]),
+        json!([far, { "op": "keep", "select": { "sphere": sphere } }]),
+    ] {
+        put(&server, &id, edits).await;
+        let [after, holes] =
+            [layer(&server, &id, "alpha").await, layer(&server, &id, "holes").await];
+        let truth: Vec<f32> = before.iter().zip(&after).map(|(a, b)| (a - b).max(0.0)).collect();
+        assert_eq!(holes, truth);
+        sizes.push(holes.iter().sum::<f32>() / before.iter().sum::<f32>());
+    }
+    assert!(sizes[1] < sizes[2] && sizes[2] > 0.99, "{sizes:?}");
+    // In levels, beside the alpha of the same call.
+    let mut shown = Vec::new();
+    for kind in ["alpha", "holes"] {
+        let url = format!("view?from=0&format=grey8&width=64&height=48&kind={kind}");
+        shown.push(get(&server, &id, &url).await.bytes().await.unwrap());
+    }
+    assert!(shown[0].iter().zip(&shown[1]).zip(&before).all(|((alpha, hole), before)| {
+        (f32::from(*alpha) + f32::from(*hole) - 255.0 * before).abs() <= 1.0
+    }));
+}
+
 #[tokio::test]
 async fn a_pick_and_a_part_take_one_thing() {
     let (server, id) = start().await;

@@ -60,7 +60,7 @@ async fn watching_ends_with_done() {
     let mut client = client(&stand).await;
     let sent = tokio_stream::iter(messages(&upload(), &Options::default()));
     let scene = client.create_scene(sent).await.unwrap().into_inner();
-    let request = pb::WatchSceneRequest { scene_id: scene.id, semantics: false };
+    let request = pb::WatchSceneRequest { scene_id: scene.id, semantics: false, edits: false };
     let mut events = client.watch_scene(request).await.unwrap().into_inner();
     let mut states = Vec::new();
     while let Some(event) = events.message().await.unwrap() {

@@ -18,7 +18,7 @@ use segsplat::{
     scene::{Gaussians, Upload, UploadFile},
 };
 use segsplat_testing::scenes::{camera, cloud};
-use serde_json::Value;
+use serde_json::{Value, json};
 use zip::{ZipArchive, ZipWriter, write::SimpleFileOptions};
 
 use crate::common::{
@@ -155,29 +155,49 @@ fn each_level_is_the_whole_scene_by_place() {
 }
 
 #[tokio::test]
-async fn forms_are_made_when_a_scene_is_done_and_not_by_its_readers() {
-    let server = TestServer::with(|_, _| {}).await;
-    let mut bytes = Vec::new();
-    let file = SplatFile::new(&SPLAT, cloud(BLOCKS_MIN + 40_000, 0, 5), None).unwrap();
-    file.write(&mut bytes).unwrap();
-    let splats = UploadFile { name: "large.splat".to_owned(), bytes };
-    let upload = Upload { splats: Some(splats), ..Upload::default() };
-    let get = async |path: String| client().get(server.url(&path)).send().await.unwrap();
-    let made = async || {
-        let text = get("/metrics".to_owned()).await.text().await.unwrap();
+async fn forms_are_made_when_a_scene_changes_and_not_by_its_readers() {
+    let mut server = TestServer::with(|_, _| {}).await;
+    let upload = large(40_000);
+    let get = async |server: &TestServer, path: &str| {
+        client().get(server.url(path)).send().await.unwrap().bytes().await.unwrap()
+    };
+    let made = async |server: &TestServer| {
+        let text = String::from_utf8(get(server, "/metrics").await.to_vec()).unwrap();
         let name = "segsplat_stage_seconds_count{stage=\"coarse\"} ";
         text.lines().find_map(|line| line.strip_prefix(name)?.parse::<f64>().ok()).unwrap_or(0.0)
     };
-    let before = made().await;
+    let before = made(&server).await;
     let (id, _) = http(server.addr).create(&upload, &Options::wait()).await.unwrap();
-    eventually("the forms", async || (made().await > before).then_some(())).await;
-    for format in ["packed", "sog_lod", "packed"] {
-        let answer = get(format!("/v1/scenes/{id}/export?format={format}")).await;
-        let bytes = answer.bytes().await.unwrap();
-        if format == "sog_lod" {
-            let counts: Vec<usize> = levels(&bytes).iter().map(Vec::len).collect();
-            assert!(counts[0] >= BLOCKS_MIN && counts.len() > 1, "{counts:?}");
-        }
-    }
-    assert!((made().await - before - 1.0).abs() < 0.5, "readers take those that are there");
+    let export = |format: &str| format!("/v1/scenes/{id}/export?format={format}");
+    // The packed form, once the forms are there: those who read it made none.
+    let read = async |server: &TestServer, times: f64| {
+        let more = async || (made(server).await > before + times - 0.5).then_some(());
+        eventually("the forms", more).await;
+        let bytes = get(server, &export("packed")).await;
+        assert!((made(server).await - before - times).abs() < 0.5, "readers take what is there");
+        bytes
+    };
+    let whole = read(&server, 1.0).await;
+    let counts: Vec<usize> =
+        levels(&get(&server, &export("sog_lod")).await).iter().map(Vec::len).collect();
+    assert!(counts[0] >= BLOCKS_MIN && counts.len() > 1, "{counts:?}");
+    assert_eq!(read(&server, 1.0).await, whole);
+    let sphere = json!({ "center": [0, 0, 4], "radius": 1 });
+    let edits = json!({ "edits": [{ "op": "delete", "select": { "sphere": sphere } }] });
+    let url = server.url(&format!("/v1/scenes/{id}/edits"));
+    let put: Value = client().put(url).json(&edits).send().await.unwrap().json().await.unwrap();
+    assert!(put["counts"][0].as_u64().unwrap() > 0, "{put}");
+    let edited = read(&server, 2.0).await;
+    assert!(edited.len() < whole.len(), "they are those of the edited scene");
+    server = server.restart().await;
+    assert_eq!(read(&server, 3.0).await, edited);
+}
+
+/// A file of so many Gaussians over the fewest that have forms.
+fn large(more: usize) -> Upload {
+    let mut bytes = Vec::new();
+    let file = SplatFile::new(&SPLAT, cloud(BLOCKS_MIN + more, 0, 5), None).unwrap();
+    file.write(&mut bytes).unwrap();
+    let splats = UploadFile { name: "large.splat".to_owned(), bytes };
+    Upload { splats: Some(splats), ..Upload::default() }
 }

@@ -134,7 +134,8 @@ async fn who_waits_for_what_is_being_made_is_answered_at_once_when_the_server_st
     let scene_id = list["scenes"][0]["id"].as_str().unwrap().to_owned();
     let events = server.url(&format!("/v1/scenes/{scene_id}/events"));
     let events = client.get(events).send().await.unwrap();
-    let request = pb::WatchSceneRequest { scene_id: scene_id.clone(), semantics: false };
+    let request =
+        pb::WatchSceneRequest { scene_id: scene_id.clone(), semantics: false, edits: false };
     let mut watch = rpc.clone().watch_scene(request).await.unwrap().into_inner();
     let second = Options { wait_ms: Some(600_000), ..Options::default() };
     let second =

@@ -3,6 +3,8 @@ links, in frames of other pages, and by keys and fingers."""
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import re
 import urllib.request
@@ -10,6 +12,7 @@ import urllib.request
 import numpy as np
 import pytest
 from acts import WAIT_MS, Camera, pixels, settled, until
+from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 from test_panels import grave
 
@@ -78,6 +81,54 @@ def test_a_word_is_deleted_and_comes_back_bit_for_bit(room: Page, url: str, scen
     room.click("#redo")
     edited(room, "Deleted: ball")
     assert room.evaluate("segsplat.drawing.count") == all_of_it - n
+
+
+def test_what_somebody_else_edits_is_shown_and_nothing_jumps(
+        room: Page, url: str, scene: str) -> None:
+    before, all_of_it = pixels(room), room.evaluate("segsplat.drawing.count")
+    room.locator("#view").press("ArrowRight")
+    settled(room)
+    camera = room.evaluate("segsplat.state.camera")
+    told = kept(url, scene, {"edits": [{"op": "delete", "select": {"text": "box"}}]})
+    edited(room, "Deleted: box")
+    assert rows(room) == ["Deleted: box"]
+    n = told["counts"][0]  # type: ignore[index]
+    assert n > 0 and room.evaluate("segsplat.drawing.count") == all_of_it - n
+    assert room.evaluate("segsplat.state.camera") == camera
+    kept(url, scene, SHUT)
+    edited(room, "as it was made")
+    assert rows(room) == []
+    room.locator("#view").press("Home")
+    settled(room)
+    assert np.array_equal(pixels(room), before)
+
+
+def test_holes_are_striped_where_the_server_says_and_nowhere_else(
+        room: Page, url: str, scene: str) -> None:
+    holes = room.locator("#holes")
+    expect(holes).to_be_hidden()
+    room.locator("#view").click(position={"x": 640, "y": 400})
+    expect(room.locator("#act-on")).to_have_text("thing 1")
+    room.click("#act-delete")
+    edited(room, "Deleted: a clicked thing")
+    expect(holes, "nothing is behind the wall").to_be_visible()
+    with room.expect_response(lambda answer: "kind=holes" in answer.url) as asked:
+        holes.click()
+    assert asked.value.ok, asked.value.text()
+    with urllib.request.urlopen(asked.value.url) as answer:
+        seen = np.asarray(Image.open(io.BytesIO(answer.read())))
+    assert seen.max() > 200 and (seen == 0).mean() > 0.1
+    drawn = ("document.getElementById('over').getContext('2d')"
+             ".getImageData(0, 0, 1280, 800).data.some((v) => v)")
+    until(room, drawn)
+    encoded = room.evaluate("document.getElementById('over').toDataURL()").split(",")[1]
+    over = Image.open(io.BytesIO(base64.b64decode(encoded))).resize(seen.shape[::-1])
+    alpha = np.asarray(over)[..., 3]
+    striped = (np.add(*np.indices(seen.shape)) & 8).astype(bool)
+    assert np.abs(alpha[striped].astype(int) - seen[striped]).mean() < 2
+    assert alpha[~striped].mean() < 2 and alpha[seen == 0].max() == 0
+    holes.click()
+    until(room, f"!{drawn}")
 
 
 def test_what_is_clicked_is_recoloured_and_deleted_by_a_key(

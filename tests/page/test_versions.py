@@ -45,7 +45,7 @@ def test_the_first_version_is_shown_again_with_what_was_gained(
 
     page.route(f"**/v1/scenes/{splats}", refined)
     held: list[Route] = []
-    page.route("**/events", lambda route: held.append(route))
+    page.route("**/events?edits=true", lambda route: held.append(route))
     page.goto(f"{url}/#scene={splats}")
     settled(page)
     page.evaluate("segsplat.state.scene.first = true")

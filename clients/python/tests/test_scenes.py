@@ -53,6 +53,17 @@ def test_events_go_on_until_the_first_text_is_answered(client: Client, photos: P
     scene.delete()
 
 
+def test_who_asks_for_edits_is_told_each_change(client: Client, photos: Path) -> None:
+    scene = client.scene(photos, semantics="off", density="full", progress=False)
+    events = scene.events(edits=True)
+    assert [next(events), next(events)] == [Event("done"), Event("edited", edits=0)]
+    client.get(scene.id).edit({"op": "delete",
+                               "select": {"sphere": {"center": [0, 0, 0], "radius": 0.01}}})
+    assert next(events) == Event("edited", edits=1), "whoever changed it"
+    scene.delete()
+    assert list(events) == [Event("cancelled")]
+
+
 def test_events_end_with_the_last(client: Client, photos: Path) -> None:
     scene = client.scene(photos, wait=False, semantics="off", density="full")
     events = list(scene.events())

@@ -162,7 +162,11 @@ def test_what_a_query_found_is_hidden_and_kept(client: Client, photos: Path) -> 
     assert found.hide() == [found[0].gaussians], "an edit for what was found alone"
     assert scene.edits() == [{"op": "delete", "select": {"text": "box"}}]
     assert len(scene.gaussians().means) == whole - found[0].gaussians
+    seen = scene.view(["alpha", "holes"])
     scene.undo()
+    assert scene.view("holes").holes.max() == 0, "nothing is edited"
+    gone = np.maximum(scene.view("alpha").alpha - seen.alpha, 0)
+    np.testing.assert_allclose(seen.holes, gone, atol=1e-6)
     assert scene.query("box", masks=False).keep() == [found[0].gaussians]
     assert len(scene.gaussians().means) == found[0].gaussians
     with pytest.raises(ValueError, match="for one text"):

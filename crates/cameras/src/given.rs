@@ -2,7 +2,10 @@
 
 use std::collections::BTreeSet;
 
-use segsplat_core::error::{Error, Result};
+use segsplat_core::{
+    error::{Error, Result},
+    scene::Camera,
+};
 
 /// What is known of one photo.
 #[derive(Clone, Debug, Default)]
@@ -13,6 +16,9 @@ pub struct PhotoKeypoints {
     pub focal: Option<f64>,
     /// Keypoints, pixels.
     pub keypoints: Vec<[f32; 2]>,
+    /// What a network says of its camera: nearly right or quite wrong, in a world of the network's
+    /// own that all photos share.
+    pub guess: Option<Camera>,
     /// Time in the video that the photo is from, seconds.
     pub seconds: Option<f64>,
 }
@@ -70,6 +76,9 @@ pub(crate) fn check(
             && !(focal.is_finite() && focal > 0.0)
         {
             return Err(Error::invalid(name(&format!("focal is {focal}; it must be over 0"))));
+        }
+        if let Some(guess) = photo.guess {
+            guess.intrinsics.validated(&name("guess"))?;
         }
         if let Some(keypoint) = photo.keypoints.iter().find(|k| !k.iter().all(|v| v.is_finite())) {
             return Err(Error::invalid(name(&format!("keypoint {keypoint:?} is not finite"))));

@@ -23,28 +23,54 @@ const PHOTOS_MIN: usize = 3;
 /// Median distance of keypoints that are off by one along x and along y.
 const MEDIAN_OF_ONE: f64 = 1.177;
 
-/// Takes photos out of a solution that few points hold, one after the other, the worst first.
-/// Returns them, each with the number of its points that two more photos see.
+/// Takes photos out of a solution that few points hold, each with the number of its points that two
+/// more photos see.
 pub(crate) fn drop_few(
     survey: &Survey,
     best: &mut Candidate,
     cancel: &AtomicBool,
 ) -> Vec<(usize, usize)> {
+    let fewest = |best: &Candidate| {
+        let points = points(best);
+        let fewest = placed(best).min_by_key(|photo| points[*photo])?;
+        (points[fewest] < POINTS_MIN).then(|| (fewest, points[fewest]))
+    };
+    drop_worst(survey, best, cancel, fewest)
+}
+
+/// Takes photos out of a solution whose turns are not known, each with its deviation in degrees.
+pub(crate) fn drop_loose(
+    survey: &Survey,
+    best: &mut Candidate,
+    cancel: &AtomicBool,
+) -> Vec<(usize, f64)> {
+    let loosest = |best: &Candidate| {
+        let turns = turns_deg(survey, best, cancel)?;
+        let loosest = placed(best).max_by(|a, b| turns[*a].total_cmp(&turns[*b]))?;
+        (turns[loosest] > TURN_MAX_DEG).then(|| (loosest, turns[loosest]))
+    };
+    drop_worst(survey, best, cancel, loosest)
+}
+
+/// Takes out the `worst` photo of a solution, one after the other, with what was measured of it.
+fn drop_worst<T>(
+    survey: &Survey,
+    best: &mut Candidate,
+    cancel: &AtomicBool,
+    worst: impl Fn(&Candidate) -> Option<(usize, T)>,
+) -> Vec<(usize, T)> {
     let mut dropped = Vec::new();
-    while let Some((photo, points)) = fewest(best) {
+    while placed(best).count() > PHOTOS_MIN
+        && let Some((photo, measured)) = worst(best)
+    {
         without(survey, best, &[photo], cancel);
-        dropped.push((photo, points));
+        dropped.push((photo, measured));
     }
     dropped
 }
 
-/// The photo that fewest points hold, where they are too few.
-fn fewest(best: &Candidate) -> Option<(usize, usize)> {
-    let points = points(best);
-    let placed = (0..points.len()).filter(|&i| best.grown.poses[i].is_some());
-    let placed: Vec<(usize, usize)> = placed.map(|i| (i, points[i])).collect();
-    let worst = placed.iter().min_by_key(|(_, points)| *points)?;
-    (placed.len() > PHOTOS_MIN && worst.1 < POINTS_MIN).then_some(*worst)
+fn placed(best: &Candidate) -> impl Iterator<Item = usize> + '_ {
+    (0..best.grown.poses.len()).filter(|&photo| best.grown.poses[photo].is_some())
 }
 
 /// Points of each photo that two more photos see.
@@ -58,25 +84,6 @@ pub(crate) fn points(best: &Candidate) -> Vec<usize> {
         }
     }
     points
-}
-
-/// Takes photos out of a solution whose turns are not known, one after the other, the worst first.
-pub(crate) fn drop_loose(survey: &Survey, best: &mut Candidate, cancel: &AtomicBool) -> Vec<usize> {
-    let mut dropped = Vec::new();
-    while let Some(photo) = loosest(survey, best, cancel) {
-        without(survey, best, &[photo], cancel);
-        dropped.push(photo);
-    }
-    dropped
-}
-
-/// The photo whose turn is known least, where that is too little.
-fn loosest(survey: &Survey, best: &Candidate, cancel: &AtomicBool) -> Option<usize> {
-    let turns = turns_deg(survey, best, cancel)?;
-    let is_placed = |photo: &usize| best.grown.poses[*photo].is_some();
-    let placed: Vec<usize> = (0..turns.len()).filter(is_placed).collect();
-    let loosest = *placed.iter().max_by(|a, b| turns[**a].total_cmp(&turns[**b]))?;
-    (placed.len() > PHOTOS_MIN && turns[loosest] > TURN_MAX_DEG).then_some(loosest)
 }
 
 /// The deviation of each photo's turn, degrees, for keypoints that are off each by itself, by as

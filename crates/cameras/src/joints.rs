@@ -75,7 +75,7 @@ pub(crate) fn without(
 /// The placed photos that strong links do not join with the largest part.
 fn beside_largest(survey: &Survey, links: &[Link], grown: &Grown) -> Vec<usize> {
     let placed: Vec<usize> = (0..grown.poses.len()).filter(|&i| grown.poses[i].is_some()).collect();
-    let is_placed = |link: &&Link| between_placed(grown, link.photos).is_some();
+    let is_placed = |link: &&Link| between_placed(&grown.poses, link.photos).is_some();
     let least = weakest_min(placed.len(), links.iter().filter(is_placed).count());
     let mut part: Vec<usize> = (0..grown.poses.len()).collect();
     for (share, photos) in joints(survey, links, grown) {

@@ -1,7 +1,6 @@
 //! Cameras that are a little wrong, mended by matched keypoints: a bundle adjustment that begins
 //! with them, and leaves all of them together where they were given.
 
-use glam::{DMat3, DVec3};
 use nalgebra::{Matrix3, Vector2, Vector3};
 use segsplat_core::{
     error::{Error, Result},
@@ -13,7 +12,7 @@ use crate::{
     given::{PairMatches, PhotoKeypoints},
     grow::nearest_to,
     lens::Lens,
-    pose::{Pose, angle_deg, project},
+    pose::{Pose, angle_deg, camera_to_world, project},
     tracks::join,
 };
 
@@ -59,7 +58,7 @@ pub fn mend(
         return Err(Error::invalid("cameras: matches of other photos"));
     }
     let pixels: Vec<Vec<Vector2<f64>>> = cameras.iter().zip(photos).map(plain_pixels).collect();
-    let given: Vec<Pose> = cameras.iter().map(|camera| pose_of(&camera.camera_to_world)).collect();
+    let given: Vec<Pose> = cameras.iter().map(|camera| Pose::of(&camera.camera_to_world)).collect();
     let tracks = tracks(&given, &pixels, matches);
     let mut poses = given.clone();
     let (mut held, mut loose) = (Vec::new(), vec![false; poses.len()]);
@@ -199,17 +198,4 @@ fn off_line(between: &Pose, first: &Vector2<f64>, second: &Vector2<f64>) -> f64 
     let line = between.t.cross(&(between.r * (first / FOCAL).push(1.0)));
     let off = line.dot(&(second / FOCAL).push(1.0)).abs();
     FOCAL * off / line.xy().norm().max(f64::MIN_POSITIVE)
-}
-
-fn pose_of(pose: &CameraToWorld) -> Pose {
-    let [x, y, z] = pose.rotation().transpose().to_cols_array_2d();
-    let r = Matrix3::from_columns(&[x.into(), y.into(), z.into()]);
-    let center: Vector3<f64> = pose.center().to_array().into();
-    Pose { r, t: -(r * center) }
-}
-
-fn camera_to_world(pose: &Pose) -> CameraToWorld {
-    let axis = |row: usize| DVec3::from_array([0, 1, 2].map(|column| pose.r[(row, column)]));
-    let rotation = DMat3::from_cols(axis(0), axis(1), axis(2));
-    CameraToWorld::from_rotation(rotation, DVec3::from_array(pose.center().into()))
 }

@@ -1,6 +1,8 @@
 //! Rotations and poses, world to camera.
 
+use glam::{DMat3, DVec3};
 use nalgebra::{Matrix3, Vector3};
+use segsplat_core::scene::CameraToWorld;
 
 /// World to camera: `x = r X + t`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -12,6 +14,13 @@ pub(crate) struct Pose {
 impl Pose {
     pub(crate) fn identity() -> Self {
         Self { r: Matrix3::identity(), t: Vector3::zeros() }
+    }
+
+    pub(crate) fn of(camera_to_world: &CameraToWorld) -> Self {
+        let [x, y, z] = camera_to_world.rotation().transpose().to_cols_array_2d();
+        let r = Matrix3::from_columns(&[x.into(), y.into(), z.into()]);
+        let center: Vector3<f64> = camera_to_world.center().to_array().into();
+        Self { r, t: -(r * center) }
     }
 
     pub(crate) fn seen(&self, world: &Vector3<f64>) -> Vector3<f64> {
@@ -83,4 +92,10 @@ pub(crate) fn project(matrix: &Matrix3<f64>) -> Option<Matrix3<f64>> {
     let flip = Vector3::new(1.0, 1.0, (u * v_t).determinant().signum());
     (svd.singular_values[1] > 1e-9 * svd.singular_values[0])
         .then(|| u * Matrix3::from_diagonal(&flip) * v_t)
+}
+
+pub(crate) fn camera_to_world(pose: &Pose) -> CameraToWorld {
+    let axis = |row: usize| DVec3::from_array([0, 1, 2].map(|column| pose.r[(row, column)]));
+    let rotation = DMat3::from_cols(axis(0), axis(1), axis(2));
+    CameraToWorld::from_rotation(rotation, DVec3::from_array(pose.center().into()))
 }

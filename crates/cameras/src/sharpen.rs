@@ -219,6 +219,7 @@ mod tests {
             views: (0..4).map(view).collect(),
             pairs: Vec::new(),
             priors: vec![prior],
+            guess: None,
             seed: 0,
         };
         let tracks: Vec<_> = (0..99).map(|k| (0..4).map(|photo| (photo, k)).collect()).collect();

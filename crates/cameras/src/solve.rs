@@ -73,6 +73,7 @@ pub fn solve(
         false => (survey.clone(), best.clone()),
     };
     let loose = held::drop_loose(&seen, &mut sharp, cancel);
+    let loose: Vec<usize> = loose.into_iter().map(|(photo, _)| photo).collect();
     if !loose.is_empty() {
         joints::without(&survey, &mut best, &loose, cancel);
     }

@@ -13,7 +13,7 @@ use crate::{
     lens::Lens,
     pose::Pose,
     rotations,
-    survey::{Link, Pair, Survey, View, strength},
+    survey::{Guess, Link, Pair, Survey, View, strength},
     tracks::{self, Sighting},
     two_view,
 };
@@ -36,6 +36,10 @@ const LINK_INLIERS_MIN: usize = 15;
 const FINISH_ROUNDS: usize = 4;
 const FINISH_GAIN: f64 = 1.01;
 const KEPT_SHARE: f64 = 0.95;
+/// How far off the keypoints of a guess may be, turn by turn, in distances at which keypoints
+/// agree: the first is some three degrees.
+const GUESS_OFF: [f64; 4] = [16.0, 8.0, 4.0, 2.0];
+const GUESS_STEPS: usize = 12;
 
 /// A solution and what it was made from.
 #[derive(Clone)]
@@ -89,7 +93,26 @@ pub(crate) fn survey(
         }
         Pair { photos: given.photos, matches: order.iter().map(|&i| given.pairs[i]).collect() }
     });
-    Survey { views, pairs: pairs.collect(), priors, seed: options.seed }
+    let pairs = pairs.collect();
+    let guess = guess_of(photos, &views, &priors);
+    Survey { views, pairs, priors, guess, seed: options.seed }
+}
+
+/// What a network says of the photos; of a lens that EXIF knows it says nothing.
+fn guess_of(photos: &[PhotoKeypoints], views: &[View], priors: &[LensPrior]) -> Option<Guess> {
+    let poses: Vec<Option<Pose>> =
+        photos.iter().map(|photo| Some(Pose::of(&photo.guess?.camera_to_world))).collect();
+    let lens = |(lens, prior): (usize, &LensPrior)| {
+        let own = photos.iter().zip(views).filter(|(_, view)| view.lens == lens && !prior.known);
+        let focal = |photo: &PhotoKeypoints| {
+            photo.guess.map(|guess| (guess.intrinsics.fx * guess.intrinsics.fy).sqrt())
+        };
+        let mut focals: Vec<f64> = own.filter_map(|(photo, _)| focal(photo)).collect();
+        focals.sort_by(f64::total_cmp);
+        Lens { focal: focals.get(focals.len() / 2).copied().unwrap_or(prior.focal), k1: 0.0 }
+    };
+    let lenses = priors.iter().enumerate().map(lens).collect();
+    (poses.iter().flatten().count() >= 2).then_some(Guess { poses, lenses })
 }
 
 fn is_link(link: &Link) -> bool {
@@ -122,6 +145,7 @@ pub(crate) fn candidates(
         let links = rotations::consistent(survey.views.len(), &links);
         all.extend(grow_from_pairs(survey, &lenses, &links, cancel));
     }
+    all.extend(survey.guess.as_ref().and_then(|guess| from_guess(survey, guess, &first, cancel)));
     all.sort_by(|a, b| b.score.total_cmp(&a.score));
     unless_cancelled(cancel)?;
     progress(0.9);
@@ -132,7 +156,7 @@ pub(crate) fn candidates(
 /// among them, and looks again for the places of the photos that are left.
 pub(crate) fn finish(survey: &Survey, best: &mut Candidate, cancel: &AtomicBool) {
     for _ in 0..FINISH_ROUNDS {
-        let tracks = retracked(survey, &best.grown);
+        let tracks = retracked(survey, &best.grown.poses, &best.grown.lenses);
         let mut grower = Grower::new(survey, &tracks, &best.links, &best.grown.lenses, cancel);
         grower.state.poses.clone_from(&best.grown.poses);
         let before = grower.placed();
@@ -151,13 +175,13 @@ pub(crate) fn finish(survey: &Survey, best: &mut Candidate, cancel: &AtomicBool)
     }
 }
 
-/// Tracks of the matches that agree with a solution.
-fn retracked(survey: &Survey, grown: &Grown) -> Vec<Vec<Sighting>> {
+/// Tracks of the matches that agree with cameras.
+fn retracked(survey: &Survey, poses: &[Option<Pose>], lenses: &[Lens]) -> Vec<Vec<Sighting>> {
     let mut agreeing: Vec<(f64, &Pair, Vec<u32>)> = Vec::new();
     for pair in &survey.pairs {
-        let Some(pose) = between_placed(grown, pair.photos) else { continue };
-        let directions = survey.directions(pair, &grown.lenses);
-        let threshold = survey.threshold(pair, &grown.lenses);
+        let Some(pose) = between_placed(poses, pair.photos) else { continue };
+        let directions = survey.directions(pair, lenses);
+        let threshold = survey.threshold(pair, lenses);
         let near = two_view::inliers_of(&pose, &directions, threshold * threshold);
         let log_chance = two_view::log_chance_of(&directions, near.len(), threshold);
         if is_more_than_chance(near.len(), log_chance) {
@@ -195,7 +219,7 @@ pub(crate) fn links_under(survey: &Survey, best: &Candidate) -> Vec<Link> {
     let links = survey.links(&best.grown.lenses, 60, Some(&before));
     let mut links: Vec<Link> = links.into_iter().flatten().filter(is_link).collect();
     for link in &mut links {
-        if let Some(pose) = between_placed(&best.grown, link.photos) {
+        if let Some(pose) = between_placed(&best.grown.poses, link.photos) {
             survey.lean(link, &pose, &best.grown.lenses);
         }
     }
@@ -269,6 +293,37 @@ fn grow_from_pairs(
     grown
 }
 
+/// The solution that a guess leads to: its cameras go where the matches near them say, and what
+/// they do not hold is placed as in any other.
+fn from_guess(
+    survey: &Survey,
+    guess: &Guess,
+    first: &[Option<Link>],
+    cancel: &AtomicBool,
+) -> Option<Candidate> {
+    let (mut poses, mut lenses) = (guess.poses.clone(), guess.lenses.clone());
+    for times in GUESS_OFF {
+        let loose = survey.loosened(times);
+        let tracks = retracked(&loose, &poses, &lenses);
+        let mut grower = Grower::new(&loose, &tracks, &[], &lenses, cancel);
+        grower.state.poses = poses;
+        grower.triangulate();
+        grower.adjust(GUESS_STEPS);
+        Grown { poses, lenses, .. } = grower.state;
+    }
+    let links = survey.links(&lenses, 60, Some(first));
+    let links: Vec<Link> = links.into_iter().flatten().filter(is_link).collect();
+    let links = rotations::consistent(survey.views.len(), &links);
+    let tracks = retracked(survey, &poses, &lenses);
+    let mut grower = Grower::new(survey, &tracks, &links, &lenses, cancel);
+    grower.state.poses = poses;
+    grower.triangulate();
+    grower.place_all(survey.seed);
+    let Grower { state: grown, .. } = grower;
+    let score = score_of(survey, &grown);
+    (grown.poses.iter().flatten().count() >= 2).then_some(Candidate { grown, links, tracks, score })
+}
+
 /// Pairs to start from: many matches, rays that meet at a wide angle, and no two of the same photo
 /// where it can be avoided.
 fn first_pairs(links: &[Link], count: usize) -> Vec<Link> {
@@ -305,7 +360,7 @@ pub(crate) fn between(first: &Pose, second: &Pose) -> Pose {
 /// How well a solution explains the matches of all pairs of photos that it places.
 pub(crate) fn score_of(survey: &Survey, grown: &Grown) -> f64 {
     let of = |pair: &Pair| {
-        let pose = between_placed(grown, pair.photos)?;
+        let pose = between_placed(&grown.poses, pair.photos)?;
         let directions = survey.directions(pair, &grown.lenses);
         Some(two_view::fit(&pose, &directions, survey.threshold(pair, &grown.lenses)))
     };
@@ -313,17 +368,96 @@ pub(crate) fn score_of(survey: &Survey, grown: &Grown) -> f64 {
 }
 
 /// The pose of the second of two placed photos from the first.
-pub(crate) fn between_placed(grown: &Grown, photos: [usize; 2]) -> Option<Pose> {
-    let [first, second] = photos.map(|photo| grown.poses[photo].as_ref());
+pub(crate) fn between_placed(poses: &[Option<Pose>], photos: [usize; 2]) -> Option<Pose> {
+    let [first, second] = photos.map(|photo| poses[photo].as_ref());
     Some(between(first?, second?))
 }
 
 /// Matches of a link's pair that a solution explains, and those that the link's own geometry does.
 pub(crate) fn explained(survey: &Survey, link: &Link, grown: &Grown) -> Option<(f64, f64)> {
-    let pose = between_placed(grown, link.photos)?;
+    let pose = between_placed(&grown.poses, link.photos)?;
     let pair = &survey.pairs[link.pair];
     let directions = survey.directions(pair, &grown.lenses);
     let threshold = survey.threshold(pair, &grown.lenses);
     let near = two_view::inliers_of(&pose, &directions, threshold * threshold);
     Some((near.len() as f64, link.geometry.inliers.len() as f64))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::AtomicBool;
+
+    use nalgebra::Vector3;
+    use segsplat_core::scene::{Camera, Intrinsics};
+
+    use super::{between, from_guess, survey};
+    use crate::{
+        given::{PairMatches, PhotoKeypoints, SolveOptions},
+        lens::Lens,
+        pose::{Pose, angle_deg, camera_to_world, rotation},
+        rng::Rng,
+    };
+
+    const SIZE: [u32; 2] = [640, 480];
+    const FOCAL: f64 = 560.0;
+
+    /// The largest turn from camera to camera between two lists, degrees.
+    fn off(found: &[Option<Pose>], truth: &[Pose]) -> f64 {
+        let first = found[0].expect("the first photo");
+        let turn = |(found, own): (&Option<Pose>, &Pose)| {
+            let found = between(&first, &found.expect("a camera"));
+            angle_deg(&(found.r * between(&truth[0], own).r.transpose()))
+        };
+        found.iter().zip(truth).map(turn).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn a_guess_that_is_nearly_right_is_led_to_the_truth() {
+        let mut rng = Rng::new(9, 0);
+        let mut draw = || rng.below(1 << 20) as f64 / f64::from(1 << 19) - 1.0;
+        let mut point = |size: f64| Vector3::new(draw(), draw(), draw()) * size;
+        let points: Vec<Vector3<f64>> = (0..200).map(|_| point(1.0)).collect();
+        let truth: Vec<Pose> = (0..5)
+            .map(|i| Pose {
+                r: rotation(&Vector3::new(0.1, 0.2 * f64::from(i), 0.0)),
+                t: Vector3::new(0.0, 0.0, 4.0),
+            })
+            .collect();
+        let lens = Lens { focal: FOCAL, k1: 0.0 };
+        let middle = SIZE.map(|side| side as f32 / 2.0);
+        let photo = |pose: &Pose| {
+            let pixel = |point: &Vector3<f64>| {
+                let at = lens.project(&pose.seen(point)).expect("in front");
+                [at.x as f32 + middle[0], at.y as f32 + middle[1]]
+            };
+            // Three degrees off, a twentieth of the distance, and a focal length that is too long.
+            let wrong = pose.moved(
+                &(point(1.0).normalize() * 3_f64.to_radians()),
+                &(point(1.0).normalize() * 0.2),
+            );
+            let [cx, cy] = middle.map(f64::from);
+            let (fx, fy) = (1.08 * FOCAL, 1.08 * FOCAL);
+            let intrinsics = Intrinsics { fx, fy, cx, cy, width: SIZE[0], height: SIZE[1] };
+            let guess = Some(Camera { intrinsics, camera_to_world: camera_to_world(&wrong) });
+            let keypoints = points.iter().map(pixel).collect();
+            PhotoKeypoints { size: SIZE, guess, keypoints, ..PhotoKeypoints::default() }
+        };
+        let photos: Vec<PhotoKeypoints> = truth.iter().map(photo).collect();
+        // A third of the matches is wrong.
+        let other = |i: u32| if i.is_multiple_of(3) { (i * 7 + 30) % 198 / 3 * 3 } else { i };
+        let pairs: Vec<[u32; 2]> = (0..198).map(|i| [i, other(i)]).collect();
+        let pair = |photos| PairMatches { photos, pairs: pairs.clone(), scores: Vec::new() };
+        let all = (0..5).flat_map(|a| (a + 1..5).map(move |b| [a, b]));
+        let matches: Vec<PairMatches> = all.map(pair).collect();
+        let survey = survey(&photos, &matches, &SolveOptions::default());
+        let guess = survey.guess.clone().expect("a guess");
+        let before = off(&guess.poses, &truth);
+        assert!(before > 2.0, "{before} degrees");
+        let never = AtomicBool::new(false);
+        let first = survey.links(&guess.lenses, usize::MAX, None);
+        let led = from_guess(&survey, &guess, &first, &never).expect("a solution").grown;
+        let after = off(&led.poses, &truth);
+        assert!(after < 0.05, "{after} degrees of {before}");
+        assert!((led.lenses[0].focal / FOCAL - 1.0).abs() < 0.01, "{:?}", led.lenses);
+    }
 }

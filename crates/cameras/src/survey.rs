@@ -44,7 +44,16 @@ pub(crate) struct Survey {
     pub(crate) views: Vec<View>,
     pub(crate) pairs: Vec<Pair>,
     pub(crate) priors: Vec<LensPrior>,
+    /// Where at least two photos have one.
+    pub(crate) guess: Option<Guess>,
     pub(crate) seed: u64,
+}
+
+/// What a network says of the photos, in a world of its own.
+#[derive(Clone, Debug)]
+pub(crate) struct Guess {
+    pub(crate) poses: Vec<Option<Pose>>,
+    pub(crate) lenses: Vec<Lens>,
 }
 
 /// A pair whose geometry was found.
@@ -78,6 +87,13 @@ impl View {
 }
 
 impl Survey {
+    /// The same with keypoints that agree from so many times as far.
+    pub(crate) fn loosened(&self, times: f64) -> Self {
+        let mut loose = self.clone();
+        loose.views.iter_mut().for_each(|view| view.agree_px *= times);
+        loose
+    }
+
     /// Directions of the matches of a pair under lenses.
     pub(crate) fn directions(&self, pair: &Pair, lenses: &[Lens]) -> Directions {
         let [a, b] = pair.photos.map(|photo| &self.views[photo]);
@@ -174,6 +190,7 @@ mod tests {
                 views: pixels.map(view).into(),
                 pairs: vec![Pair { photos: [0, 1], matches: (0..200).map(|i| [i, i]).collect() }],
                 priors: vec![prior],
+                guess: None,
                 seed: 0,
             };
             let pair = &survey.pairs[0];

@@ -170,6 +170,9 @@ limits! {
     /// Bytes of one call that runs a network: the largest inputs of the published networks have 13
     /// million.
     inference_bytes_max: usize = 16 << 20, restart;
+    /// Callers that are told the edits of scenes as they change: each holds a connection while it
+    /// listens. One more is refused as `overloaded`.
+    watchers_max: usize = 1_024, restart;
     /// Calls that run a network, at work or waiting for its session. One more is refused as
     /// `overloaded`.
     inferences_max: usize = 8, restart;

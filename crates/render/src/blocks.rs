@@ -106,13 +106,25 @@ impl Blocks {
     /// # Errors
     /// `internal` where merged Gaussians are not Gaussians any more.
     pub fn detailed(gaussians: &Gaussians) -> Result<Self> {
+        Self::detailed_unless(gaussians, &|| Ok(()))
+    }
+
+    /// As [`Self::detailed`], until `unless` fails.
+    ///
+    /// # Errors
+    /// As there, and as `unless`, which is asked block by block.
+    pub fn detailed_unless(
+        gaussians: &Gaussians,
+        unless: &(dyn Fn() -> Result<()> + Sync),
+    ) -> Result<Self> {
         let mut blocks = Self::of(gaussians);
         let mut merger = Merger::new(gaussians);
         let mut below = 0;
         while blocks.bounds.len() - below > 1 {
             let first = blocks.bounds.len();
-            let of_block = |at: usize| merger.merge(blocks.ids(at));
-            let parts: Vec<Part> = (below..first).into_par_iter().map(of_block).collect();
+            let of_block = |at: usize| unless().map(|()| merger.merge(blocks.ids(at)));
+            let parts: Vec<Part> =
+                (below..first).into_par_iter().map(of_block).collect::<Result<_>>()?;
             // The blocks whose merged Gaussians fill one.
             let mut children = below;
             while children < first {

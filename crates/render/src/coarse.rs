@@ -44,10 +44,23 @@ impl Coarse {
     /// # Errors
     /// As [`Blocks::detailed`].
     pub fn of(own: &Gaussians, camera: &Camera) -> Result<Option<Self>> {
+        Self::of_unless(own, camera, &|| Ok(()))
+    }
+
+    /// As [`Self::of`], until `unless` fails.
+    ///
+    /// # Errors
+    /// As [`Blocks::detailed_unless`].
+    pub fn of_unless(
+        own: &Gaussians,
+        camera: &Camera,
+        unless: &(dyn Fn() -> Result<()> + Sync),
+    ) -> Result<Option<Self>> {
         if own.len() < BLOCKS_MIN {
             return Ok(None);
         }
-        let Some(merged) = Blocks::detailed(own)?.merged else { return Ok(None) };
+        let blocks = Blocks::detailed_unless(own, unless)?;
+        let Some(merged) = blocks.merged else { return Ok(None) };
         let layers = Layers::of(own.len(), &merged);
         let chosen = layers.chosen(own.len());
         let Some(&first) = chosen.first() else { return Ok(None) };

@@ -189,6 +189,7 @@ pub fn contributions(
     let center = DVec2::new(x, y);
     let mut near: Vec<(usize, Splat)> = (0..gaussians.len())
         .into_par_iter()
+        .filter(|&i| may_reach(gaussians, i, request, &lens, center))
         .filter_map(|i| Some((i, splat(gaussians, i, request, &lens)?)))
         .filter(|(_, splat)| splat.alpha(center) >= f64::from(ALPHA_MIN))
         .collect();
@@ -205,6 +206,39 @@ pub fn contributions(
         transmittance = next;
     }
     Ok(found)
+}
+
+/// Whether a Gaussian may add to a place: `false` only where [`splat`] gives none, or one whose
+/// alpha there is under [`ALPHA_MIN`]. A few of millions are left for it.
+fn may_reach(
+    gaussians: &Gaussians,
+    i: usize,
+    request: &RenderRequest,
+    lens: &Intrinsics,
+    at: DVec2,
+) -> bool {
+    let pose = request.camera.camera_to_world;
+    let mean = DVec3::from(gaussians.means()[i].map(f64::from));
+    let t = pose.rotation().transpose() * (mean - (pose.center() - gaussians.origin()));
+    if t.z < f64::from(request.near) {
+        return false;
+    }
+    let source = request.sources.get(usize::from(gaussians.source()[i].view));
+    let lost = source.map_or(0.0, |source| blur_lost(source, mean, t.z, lens));
+    let largest = gaussians.scales()[i].into_iter().fold(0.0, f32::max);
+    let variance = f64::from(largest).powi(2) + lost;
+    let opacity = f64::from(gaussians.opacities()[i]).max(f64::from(ALPHA_MIN));
+    let reach = 2.0 * (opacity / f64::from(ALPHA_MIN)).ln() + 1e-2;
+    let blur = f64::from(BLUR_PX2) + f64::from(PIXEL_PX2);
+    let reaches = |along: f64, focal: f64, center: f64, size: u32, at: f64| {
+        // A row of the Jacobian is no longer than it is at the edge of the widened picture.
+        let margin = f64::from(FRUSTUM_MARGIN) * 0.5 * f64::from(size) / focal;
+        let edge = (center / focal).abs().max(((f64::from(size) - center) / focal).abs()) + margin;
+        let row = (focal / t.z).powi(2) * (1.0 + edge.powi(2));
+        (focal * along / t.z + center - at).powi(2) <= reach * (row * variance + blur)
+    };
+    reaches(t.x, lens.fx, lens.cx, lens.width, at.x)
+        && reaches(t.y, lens.fy, lens.cy, lens.height, at.y)
 }
 
 /// A Gaussian on the picture.

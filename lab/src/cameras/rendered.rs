@@ -8,7 +8,7 @@ use serde_json::json;
 use super::{
     captures::{CAPTURES, Exif, Rendered},
     compared::number,
-    hidden::{RIGHT_DEG, Solved},
+    hidden::{Guess, RIGHT_DEG, Solved},
 };
 use crate::{
     error::{Error, Result},
@@ -37,6 +37,8 @@ pub(crate) struct Args {
     /// Write the captures and solve none
     #[arg(long, requires = "write")]
     only_write: bool,
+    #[command(flatten)]
+    guess: Guess,
     #[command(flatten)]
     setup: Setup,
 }
@@ -81,7 +83,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             capture.write(dir)?;
         }
         if let Some(engine) = &engine {
-            measure(engine, &capture, &mut tally, rows)?;
+            measure(engine, &capture, &args.guess, &mut tally, rows)?;
         }
     }
     let Tally { captures, placed, within, within_median, refused, wrong, foreign, focal } = tally;
@@ -97,6 +99,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
 fn measure(
     engine: &Pipeline,
     capture: &Rendered,
+    guess: &Guess,
     tally: &mut Tally,
     rows: &mut Rows,
 ) -> Result<()> {
@@ -104,7 +107,7 @@ fn measure(
     let cameras = capture.cameras.iter().filter(|(file, _)| Some(file) != foreign);
     let cameras: HashMap<_, _> = cameras.cloned().collect();
     let expected = cameras.len();
-    let solved = Solved::new(engine, &capture.upload, &cameras)?;
+    let solved = Solved::new(engine, &capture.upload, &cameras, guess)?;
     let named = foreign.map(|file| is_left_out(&solved.found, &solved.files, file));
     let compared = solved.compared;
     let (outcome, accepted) = (solved.outcome(), solved.found.refused.is_none());

@@ -107,8 +107,9 @@ class Decoder(nn.Module):
         return torch.cat([a.sin(), a.cos()], -1)
 
     def grid(self, h, w, device):
-        y = (torch.arange(h, device=device) + 0.5) / h * 2 - 1
-        x = (torch.arange(w, device=device) + 0.5) / w * 2 - 1
+        # Floats from the start: a graph traced from whole numbers gets 64-bit floats, which WebGPU has not.
+        y = (torch.arange(h, device=device, dtype=torch.float32) + 0.5) / h * 2 - 1
+        x = (torch.arange(w, device=device, dtype=torch.float32) + 0.5) / w * 2 - 1
         return torch.stack([x[None].expand(h, w), y[:, None].expand(h, w)], -1)
 
     def forward(self, image_embeddings, point_coords, point_labels):

@@ -217,6 +217,9 @@ pub(super) fn event(event: Event) -> pb::SceneEvent {
             let version = Some(version);
             pb::SceneEvent { version, fraction, ..of(pb::SceneState::Done) }
         }
+        Event::Edited { edits } => {
+            pb::SceneEvent { edits: Some(edits as u64), ..of(pb::SceneState::Done) }
+        }
         Event::Failed(error) => {
             pb::SceneEvent { error: Some(scene_error(error)), ..of(pb::SceneState::Failed) }
         }
@@ -597,7 +600,7 @@ both_ways! {
     CameraUse = CameraUse { Mended, Given }
     SemanticsMode = Semantics { Lazy, Eager, Off }
     Density = Density { Thinned, Full }
-    PictureKind = Kind { Color, Depth, Alpha, Semantics, Relevancy, Mask }
+    PictureKind = Kind { Color, Depth, Alpha, Holes, Semantics, Relevancy, Mask }
     Format = Format { Png, Jpeg, Webp, Npy, Rgb8, Rgba8, Grey8 }
     Preset = Preset { Default, Paper }
     MaskLevel = MaskLevel { Widest, Whole, Part, Subpart }

@@ -19,8 +19,8 @@ use crate::{
     error::{Error, ErrorCode, Result},
     scene::{CamerasMode, SceneId, Upload, UploadCameras},
     service::{
-        AddPhotos, CreateScene, Export, PageRequest, PictureKind, SceneStatus, SemanticsMode,
-        ViewSpec, ViewTimes, ViewsSpec,
+        AddPhotos, CreateScene, Export, PageRequest, PictureKind, SceneState, SceneStatus,
+        SemanticsMode, ViewSpec, ViewTimes, ViewsSpec, WatchUntil,
     },
 };
 
@@ -62,8 +62,10 @@ impl pb::scene_service_server::SceneService for Api {
     ) -> Answer<Self::WatchSceneStream> {
         answer(self, request, |api, request| async move {
             let id = request.scene_id.parse()?;
-            let events = api.service.watch_for(&id, request.semantics).await?;
-            let cut_off = stream::once(async move { unless_whole(&api, &id).await.err() });
+            let until = WatchUntil { semantics: request.semantics, edits: request.edits };
+            let events = api.service.watch_for(&id, until).await?;
+            let cut_off =
+                stream::once(async move { unless_whole(&api, &id, until.edits).await.err() });
             let cut_off = cut_off.filter_map(|error| ready(error.map(|e| Err(logged(&e)))));
             Ok(events.map(|event| Ok(convert::event(event))).chain(cut_off).boxed())
         })
@@ -227,8 +229,11 @@ impl pb::scene_service_server::SceneService for Api {
 }
 
 /// Fails with `stopping` where the events of a scene have ended because the server stops.
-async fn unless_whole(api: &Api, id: &SceneId) -> Result<()> {
-    let goes_on = |status: SceneStatus| !status.is_settled() || status.is_refined_now();
+async fn unless_whole(api: &Api, id: &SceneId, edits: bool) -> Result<()> {
+    let goes_on = |status: SceneStatus| {
+        let is_done = status.state == SceneState::Done;
+        !status.is_settled() || status.is_refined_now() || edits && is_done
+    };
     let goes_on = api.service.get(id).await.is_ok_and(goes_on);
     if goes_on && api.drain.is_stopping() {
         return Err(Error::new(ErrorCode::Stopping, "the server is stopping; watch again"));

@@ -41,8 +41,8 @@ const VARY: [(HeaderName, &str); 1] = [(header::VARY, "accept")];
 #[serde(default)]
 #[into_params(parameter_in = Query)]
 pub(super) struct ViewParams {
-    /// `color` (default), `depth`, `alpha`, `semantics` (a fixed colour for each entry of the
-    /// bank), `relevancy` or `mask` (of a text).
+    /// `color` (default), `depth`, `alpha`, `holes` (what edits uncovered and nothing fills),
+    /// `semantics` (a fixed colour for each entry of the bank), `relevancy` or `mask` (of a text).
     #[param(inline)]
     kind: PictureKind,
 }

@@ -26,7 +26,9 @@ use crate::{
     api::{Api, request_id, server_timing, upload::check_bundle},
     error::{Error, Result},
     scene::{Refine, SceneId, SemanticsState},
-    service::{CreateScene, Event, Page, PageRequest, SceneOptions, SceneState, SceneStatus},
+    service::{
+        CreateScene, Event, Page, PageRequest, SceneOptions, SceneState, SceneStatus, WatchUntil,
+    },
 };
 
 /// What `create_scene` takes besides the upload and the scene's options.
@@ -178,6 +180,9 @@ pub(super) struct WatchParams {
     /// Go on after the scene is made until its semantics are: who asks a first text at the same
     /// time sees all of its stages.
     semantics: bool,
+    /// Go on until the scene is deleted: its list of edits is told first, and each time that it is
+    /// another one, whoever changed it.
+    edits: bool,
 }
 
 /// What happens to a scene, as it happens
@@ -201,18 +206,19 @@ pub(super) async fn events(
     headers: HeaderMap,
     mut fields: Fields,
 ) -> Result<Response, ApiError> {
-    let WatchParams { semantics } = fields.take()?;
+    let WatchParams { semantics, edits } = fields.take()?;
     fields.finish()?;
-    let events = api.service.watch_for(&id, semantics).await?;
+    let until = WatchUntil { semantics, edits };
+    let events = api.service.watch_for(&id, until).await?;
     let seen = text_of(&headers, "last-event-id");
-    if seen.is_some() && seen == end_of(&api, &id, semantics).await.as_deref() {
+    if seen.is_some() && seen == end_of(&api, &id, until).await.as_deref() {
         return Ok(StatusCode::NO_CONTENT.into_response());
     }
     // A server that stops ends the stream: the caller comes back, to the next server.
     let events = events.then(move |event| {
         let (api, id) = (api.clone(), id.clone());
         async move {
-            let id = end_of(&api, &id, semantics).await;
+            let id = end_of(&api, &id, until).await;
             let event = sse_event(&event);
             Ok::<_, Infallible>(id.into_iter().fold(event, sse::Event::id))
         }
@@ -221,12 +227,13 @@ pub(super) async fn events(
     Ok(Sse::new(events).keep_alive(keep_alive).into_response())
 }
 
-/// The id of the last event of a scene to which nothing more will happen; with `semantics` not
-/// before they are made, or never will be.
-async fn end_of(api: &Api, id: &SceneId, semantics: bool) -> Option<String> {
+/// The id of the last event of a scene to which nothing more will happen; where its semantics are
+/// awaited not before they are made, or never will be.
+async fn end_of(api: &Api, id: &SceneId, until: WatchUntil) -> Option<String> {
     let status = api.service.get(id).await.ok()?;
     let of = &status.semantics;
-    let awaited = semantics && of.available && of.state != SemanticsState::Ready;
+    let awaited = until.semantics && of.available && of.state != SemanticsState::Ready
+        || until.edits && status.state == SceneState::Done;
     let over = status.is_settled() && !status.is_refined_now() && !awaited;
     over.then(|| format!("{}-{}", status.state, status.version))
 }

@@ -34,12 +34,26 @@ impl Shared {
             return Ok(known);
         }
         let (inner, id) = (Arc::clone(self), id.clone());
-        blocking(move || {
-            let _turn = inner.edits.putting.lock();
-            let list = inner.store.edits(&id)?.map(|json| EditList::read(&json)).transpose()?;
-            Ok(inner.edits.learn(&id, list.unwrap_or_default()))
-        })
-        .await?
+        blocking(move || inner.stored_edits(&id)).await?
+    }
+
+    fn stored_edits(&self, id: &SceneId) -> Result<Arc<EditList>> {
+        let _turn = self.edits.putting.lock();
+        let list = self.store.edits(id)?.map(|json| EditList::read(&json)).transpose()?;
+        Ok(self.edits.learn(id, list.unwrap_or_default()))
+    }
+
+    /// A scene that is done after the edits that it has now, for nobody in particular. Blocks.
+    pub(in crate::service) fn load_as_served(&self, id: &SceneId) -> Result<Arc<Scene>> {
+        let list = match self.edits.known(id, None) {
+            Some(known) => known,
+            None => self.stored_edits(id)?,
+        };
+        let base = self.store.scene(id)?;
+        if list.is_empty() {
+            return Ok(base);
+        }
+        self.apply_edits(id, &list, &base).map(|edited| edited.scene)
     }
 
     /// The scene after its edits, where they are known in memory.
@@ -129,7 +143,9 @@ impl Shared {
             self.store.put_edits(id, json)?;
             self.edits.learn(id, list)
         };
-        self.come_to(&list, base)
+        let come_to = self.come_to(&list, base);
+        self.foresight.want(id);
+        come_to
     }
 
     /// What a list comes to. Blocks.

@@ -8,6 +8,7 @@ use std::{
 
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
+use tokio::sync::watch;
 
 use super::spec::EditSpec;
 use crate::{
@@ -36,6 +37,11 @@ impl EditList {
     /// Its hash; empty where there are no edits.
     pub(in crate::service) fn sha256(&self) -> &str {
         &self.sha256
+    }
+
+    /// How many there are.
+    pub(in crate::service) fn len(&self) -> usize {
+        self.specs.len()
     }
 
     pub(super) fn is_empty(&self) -> bool {
@@ -78,6 +84,8 @@ pub(in crate::service) struct Edits {
     pub(super) applying: Mutex<HashMap<SceneId, Arc<Mutex<()>>>>,
     /// Held while a list is put: what is put last is what is read here.
     pub(super) putting: Mutex<()>,
+    /// Rung when a list that is known becomes another one.
+    changed: watch::Sender<()>,
 }
 
 impl Edits {
@@ -87,7 +95,13 @@ impl Edits {
             scenes: Cache::new(limits.edited_cache_bytes_max),
             applying: Mutex::default(),
             putting: Mutex::default(),
+            changed: watch::Sender::default(),
         }
+    }
+
+    /// Rings when the list of some scene changes.
+    pub(in crate::service) fn watch(&self) -> watch::Receiver<()> {
+        self.changed.subscribe()
     }
 
     /// Bytes of edited scenes in memory.
@@ -109,7 +123,11 @@ impl Edits {
 
     pub(super) fn learn(&self, id: &SceneId, list: EditList) -> Arc<EditList> {
         let list = Arc::new(list);
-        self.lists.lock().insert(id.clone(), (Instant::now(), Arc::clone(&list)));
+        let now = (Instant::now(), Arc::clone(&list));
+        let before = self.lists.lock().insert(id.clone(), now);
+        if before.is_none_or(|(_, before)| before.sha256 != list.sha256) {
+            self.changed.send_replace(());
+        }
         list
     }
 

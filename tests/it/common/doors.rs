@@ -199,6 +199,7 @@ impl Ask {
             Some("color") => pb::Kind::Color,
             Some("depth") => pb::Kind::Depth,
             Some("alpha") => pb::Kind::Alpha,
+            Some("holes") => pb::Kind::Holes,
             Some("semantics") => pb::Kind::Semantics,
             Some("relevancy") => pb::Kind::Relevancy,
             Some("mask") => pb::Kind::Mask,

@@ -344,14 +344,21 @@ def delete(scene: Handle) -> Flow[None]:
 
 
 def events(
-    scene: Handle, tell: Callable[[Event], None] | None = None, *, semantics: bool = False
+    scene: Handle,
+    tell: Callable[[Event], None] | None = None,
+    *,
+    semantics: bool = False,
+    edits: bool = False,
 ) -> Flow[None]:
     """Items: what happens to the scene, from its present state to its last event. While it is
     refined, each better version is one more.
 
     semantics: go on after the scene is made until its semantics are; the first text makes them.
+    edits: go on until the scene is deleted; an "edited" tells that its list of edits is another
+        one, whoever changed it. The first tells the list as it is.
     """
-    asked = {"semantics": True} if semantics else {}
+    asked = {name: True for name, is_asked in
+             (("semantics", semantics), ("edits", edits)) if is_asked}
     again = 0
     while True:
         try:
@@ -362,6 +369,8 @@ def events(
             while (data := (yield Read())) is not None:
                 again, event = 0, parse(Event, _json(data))
                 made = made or event.is_last or event.event == "version"
+                if edits:
+                    made = event.event in ("failed", "cancelled")
                 if not tell:
                     yield Item(event)
                     continue
@@ -551,8 +560,8 @@ def view(
 ) -> Flow[View]:
     """Draws the scene from one camera.
 
-    kinds: "color", "depth", "alpha", "semantics", and with a `text` "relevancy" and "mask"; one or
-        several, which are drawn once.
+    kinds: "color", "depth", "alpha", "holes" (what edits uncovered and nothing fills), "semantics",
+        and with a `text` "relevancy" and "mask"; one or several, which are drawn once.
     from_, to, t: between two photos; by default at the first photo.
     eye, target, up: at a point (world units), looking at another.
     camera_to_world: [4, 4] pose, OpenCV (x right, y down, z forward), world of the upload.

@@ -165,7 +165,7 @@ def _nested(method: str, fields: dict[str, Any]) -> dict[str, Any]:
         thing = dict(rest.pop("thing"))
         side = {"side": _enum("box_side", thing.pop("side"))} if "side" in thing else {}
         taken["thing"] = {**thing, **side}
-    if "edits" in rest:
+    if method == "SetEdits":
         rest["edits_json"] = json.dumps(rest.pop("edits")).encode()
     if method == "Export":
         rest["format"] = _enum("export_format", rest["format"])
@@ -282,6 +282,7 @@ def _models(fields: dict[str, Any]) -> dict[str, Any]:
 
 def _event(fields: dict[str, Any]) -> dict[str, Any]:
     event = fields["state"] if fields["version"] is None else "version"
+    event = event if fields["edits"] is None else "edited"
     return {**fields, **(fields["error"] or {}), "event": event}
 
 

@@ -17,7 +17,7 @@ from typing_extensions import TypedDict
 from .png import encode_png
 
 Floats: TypeAlias = NDArray[np.float64]
-Kind = Literal["color", "depth", "alpha", "semantics", "relevancy", "mask"]
+Kind = Literal["color", "depth", "alpha", "holes", "semantics", "relevancy", "mask"]
 Preset = Literal["default", "paper"]
 #: Options of a scene by name.
 Method: TypeAlias = dict[str, Any]
@@ -571,8 +571,8 @@ class Event:
     """What happens to a scene."""
 
     #: "done", "failed" and "cancelled" are last; of a scene that is being refined a "version" each
-    #: follows "done".
-    event: State | Literal["version"]
+    #: follows "done". "edited" is told to who asks for edits.
+    event: State | Literal["version", "edited"]
     #: Stage at work while running.
     stage: str | None = None
     #: Share of the work that is done, 0 to 1.
@@ -585,10 +585,12 @@ class Event:
     message: str | None = None
     #: The version that is served, of a "version".
     version: int | None = None
+    #: How many edits the scene has, of an "edited".
+    edits: int | None = None
 
     @property
     def is_last(self) -> bool:
-        """Whether the scene is made, or will not be. Only versions follow."""
+        """Whether the scene is made, or will not be. Only versions and edits follow."""
         return self.event in ("done", "failed", "cancelled")
 
 

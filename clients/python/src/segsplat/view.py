@@ -56,6 +56,11 @@ class View:
         return self._of("alpha")
 
     @property
+    def holes(self) -> NDArray[np.float32]:
+        """[H, W] what edits uncovered and nothing fills, 0 to 1."""
+        return self._of("holes")
+
+    @property
     def mask(self) -> NDArray[np.bool_]:
         """[H, W] where the relevancy of the text is 0.5 or more."""
         return self._of("mask")

@@ -1,7 +1,8 @@
 //! Generated photos: points of a scene seen by known cameras, matched with a share of wrong pairs.
 
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DMat3, DQuat, DVec2, DVec3};
 use segsplat_cameras::{PairMatches, PhotoKeypoints, Placing, Solution};
+use segsplat_core::scene::{Camera, CameraToWorld, Intrinsics};
 
 /// Random numbers (`xorshift`), uniform and normal.
 pub(crate) struct Draw(pub(crate) u64);
@@ -89,6 +90,23 @@ pub(crate) fn cloud(count: usize, half: f64, seed: u64) -> Vec<DVec3> {
     (0..count).map(|_| draw.point(half)).collect()
 }
 
+/// The cameras of a plan, each turned by `degrees` and moved by `way` in a direction of its own.
+pub(crate) fn cameras(plan: &Plan, degrees: f64, way: f64) -> Vec<Camera> {
+    let mut draw = Draw(11);
+    let [width, height] = SIZE;
+    let (fx, fy) = (plan.focal, plan.focal);
+    let [cx, cy] = [width, height].map(|side| f64::from(side) * 0.5);
+    let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
+    let wrong = |truth: &Truth| {
+        let [turn, shift] = [draw.point(1.0), draw.point(1.0)].map(DVec3::normalize);
+        let turn = DMat3::from_quat(DQuat::from_scaled_axis(turn * degrees.to_radians()));
+        let rotation = truth.turn.transpose() * turn;
+        let camera_to_world = CameraToWorld::from_rotation(rotation, truth.center + shift * way);
+        Camera { intrinsics, camera_to_world }
+    };
+    plan.cameras.iter().map(wrong).collect()
+}
+
 /// Keypoints of the points that each camera sees, and the matches of all pairs.
 pub(crate) fn photos(plan: &Plan) -> (Vec<PhotoKeypoints>, Vec<PairMatches>) {
     let mut draw = Draw(plan.seed);
@@ -111,7 +129,7 @@ pub(crate) fn photos(plan: &Plan) -> (Vec<PhotoKeypoints>, Vec<PairMatches>) {
                 keypoints.push([pixel.x as f32, pixel.y as f32]);
             }
         }
-        photos.push(PhotoKeypoints { size: SIZE, focal: None, keypoints, seconds: None });
+        photos.push(PhotoKeypoints { size: SIZE, keypoints, ..PhotoKeypoints::default() });
         ids.push(seen);
     }
     let mut pairs = Vec::new();

@@ -1,5 +1,6 @@
 //! Cameras from generated matches, with exact truth.
 
 mod generated;
+mod guessed;
 mod mend;
 mod solved;

@@ -1,31 +1,14 @@
 //! Cameras that are a little wrong.
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DMat3, DVec3};
 use segsplat_cameras::{PairMatches, PhotoKeypoints, mend};
-use segsplat_core::scene::{Camera, CameraToWorld, Intrinsics};
+use segsplat_core::scene::{Camera, CameraToWorld};
 
-use crate::generated::{Draw, Plan, SIZE, arc, photos, room};
+use crate::generated::{Plan, arc, cameras, photos, room};
 
 fn plan(wrong: f64) -> Plan {
     let (points, cameras) = (room(600, 2.0, 5), arc(9, 70.0, 3.0));
     Plan { points, cameras, focal: 520.0, k1: 0.0, noise: 0.5, wrong, seed: 7 }
-}
-
-/// The cameras of a plan, each turned by `degrees` and moved by `way` in a direction of its own.
-fn cameras(plan: &Plan, degrees: f64, way: f64) -> Vec<Camera> {
-    let mut draw = Draw(11);
-    let [width, height] = SIZE;
-    let (fx, fy) = (plan.focal, plan.focal);
-    let [cx, cy] = [width, height].map(|side| f64::from(side) * 0.5);
-    let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
-    let wrong = |truth: &crate::generated::Truth| {
-        let [turn, shift] = [draw.point(1.0), draw.point(1.0)].map(DVec3::normalize);
-        let turn = DMat3::from_quat(DQuat::from_scaled_axis(turn * degrees.to_radians()));
-        let rotation = truth.turn.transpose() * turn;
-        let camera_to_world = CameraToWorld::from_rotation(rotation, truth.center + shift * way);
-        Camera { intrinsics, camera_to_world }
-    };
-    plan.cameras.iter().map(wrong).collect()
 }
 
 fn mended(cameras: &[Camera], plan: &Plan) -> Option<Vec<CameraToWorld>> {

@@ -373,9 +373,8 @@ fn any_input_is_an_answer_or_an_error_that_names_it() {
     for same in [0.0_f32, 320.0, 1e30] {
         let photo = PhotoKeypoints {
             size: SIZE,
-            focal: None,
             keypoints: vec![[same, same]; 100],
-            seconds: None,
+            ..PhotoKeypoints::default()
         };
         let pair = PairMatches {
             photos: [0, 1],

@@ -106,9 +106,13 @@ impl RawGaussians {
 
     /// The Gaussians whose number `keep` takes, in their order.
     pub(super) fn only(&self, keep: impl Fn(usize) -> bool) -> Self {
-        let ids: Vec<u32> = (0..self.means.len() as u32).filter(|&i| keep(i as usize)).collect();
-        self.picked(&ids)
+        self.picked(&taken(self.means.len(), keep))
     }
+}
+
+/// The numbers under `count` that `keep` takes.
+fn taken(count: usize, keep: impl Fn(usize) -> bool) -> Vec<u32> {
+    (0..count as u32).filter(|&i| keep(i as usize)).collect()
 }
 
 /// Gaussians that one thread checks at a time.
@@ -272,8 +276,7 @@ impl Gaussians {
 
     /// The Gaussians whose number `keep` takes, in their order.
     pub fn only(&self, keep: impl Fn(usize) -> bool) -> Self {
-        let ids: Vec<u32> = (0..self.len() as u32).filter(|&i| keep(i as usize)).collect();
-        self.picked(&ids)
+        self.picked(&taken(self.len(), keep))
     }
 
     /// Those with these numbers, in this order.

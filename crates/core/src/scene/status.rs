@@ -258,6 +258,12 @@ pub enum Event {
         /// Share of the refinement's time that is spent, 0..1.
         fraction: f32,
     },
+    /// The edits of a scene that is done, told to those who ask for them alone: the list as it is,
+    /// first, and each time that it is another one. Whose change it was, is not said.
+    Edited {
+        /// How many edits the list has.
+        edits: usize,
+    },
     /// Failed. Last event.
     Failed(SceneError),
     /// Stopped by the caller, or deleted. Last event.
@@ -265,7 +271,7 @@ pub enum Event {
 }
 
 impl Event {
-    /// Whether it is the end of making a scene. Only versions follow.
+    /// Whether it is the end of making a scene. Only versions and edits follow.
     pub fn is_last(&self) -> bool {
         matches!(self, Self::Done | Self::Failed(_) | Self::Cancelled)
     }

@@ -3,18 +3,20 @@
 
 use std::sync::Arc;
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use proptest::prelude::*;
 use segsplat_core::scene::{Camera, Gaussians, Intrinsics, RawGaussians, Region, SourcePixel};
 use segsplat_render::{
     Frame, Labels, Layer, RenderRequest, Renderer, Source, Switches,
     blocks::{BLOCK, Blocks, Frustum},
+    constants::{ALPHA_MIN, TRANSMITTANCE_MIN},
     cpu::{
         CpuRenderer,
         cull::Shown,
         lanes::KernelOptions,
         project::{Projected, project},
     },
+    oracle::{self, Contribution, Splat},
     view::View,
 };
 use segsplat_testing::{
@@ -212,4 +214,43 @@ fn pictures_of_a_gpu_with_blocks_have_the_same_bits() {
             assert!(draw(&with) == draw(&without), "{name}: blocks show");
         }
     }
+}
+
+/// Who asks for one pixel need not project every Gaussian, and finds what all of them give.
+#[test]
+fn what_adds_to_a_pixel_is_found_without_projecting_all() {
+    let (mut pixels, mut adding) = (0, 0);
+    for seed in 0..40 {
+        let mut random = Random(seed);
+        let (gaussians, request) = (scattered(400, seed), any_request(&mut random));
+        let lens = request.camera.intrinsics;
+        for _ in 0..25 {
+            let pixel =
+                [lens.width, lens.height].map(|side| (random.bits() % u64::from(side)) as u32);
+            let at = DVec2::from(pixel.map(|at| f64::from(at) + 0.5));
+            let adds = |i: usize| {
+                let splat = oracle::splat(&gaussians, i, &request, &lens)?;
+                (splat.alpha(at) >= f64::from(ALPHA_MIN)).then_some((i, splat))
+            };
+            let mut all: Vec<(usize, Splat)> = (0..gaussians.len()).filter_map(adds).collect();
+            all.sort_by(|a, b| a.1.order(&b.1));
+            let (mut left, mut wanted) = (1.0, Vec::new());
+            for (gaussian, splat) in &all {
+                let weight = left * splat.alpha(at);
+                left *= 1.0 - splat.alpha(at);
+                if left <= f64::from(TRANSMITTANCE_MIN) {
+                    break;
+                }
+                wanted.push(Contribution { gaussian: *gaussian, depth: splat.depth, weight });
+            }
+            let found = oracle::contributions(&gaussians, &request, pixel).expect("a pixel");
+            assert_eq!(found.len(), wanted.len(), "seed {seed}, {pixel:?}");
+            for (found, wanted) in found.iter().zip(&wanted) {
+                assert_eq!((found.gaussian, found.depth), (wanted.gaussian, wanted.depth));
+                assert!((found.weight - wanted.weight).abs() < 1e-12, "{found:?}, not {wanted:?}");
+            }
+            (pixels, adding) = (pixels + usize::from(!all.is_empty()), adding + all.len());
+        }
+    }
+    assert!(pixels > 300 && adding > 1_000, "{pixels} pixels, {adding} Gaussians");
 }

@@ -1,7 +1,10 @@
 //! Coarser forms of a scene: every Gaussian is in each of them once, and a picture of what has come
 //! of them is whole from the first form on.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
+
 use glam::Vec3;
+use segsplat_core::error::Error;
 use segsplat_core::scene::{Gaussians, RawGaussians};
 use segsplat_render::{
     Kinds, RenderRequest, Renderer,
@@ -25,6 +28,20 @@ fn scene() -> (Gaussians, Coarse) {
 fn small_scenes_have_none() {
     let gaussians = cloud(3_000, 0, 1);
     assert!(Coarse::of(&gaussians, &camera(64, 48)).expect("no forms").is_none());
+}
+
+#[test]
+fn they_are_left_half_made_where_nobody_wants_them_any_more() {
+    let (gaussians, _) = two_views(364, 1);
+    let asked = AtomicUsize::new(0);
+    let unless = || match asked.fetch_add(1, Ordering::Relaxed) {
+        0..100 => Ok(()),
+        _ => Err(Error::internal("nobody wants them")),
+    };
+    let left = Coarse::of_unless(&gaussians, &camera(64, 48), &unless).map(drop).expect_err("left");
+    assert_eq!(left.message(), "nobody wants them");
+    let (asked, blocks) = (asked.into_inner(), gaussians.len() / 256);
+    assert!((101..blocks / 2).contains(&asked), "{asked} of {blocks} blocks");
 }
 
 #[test]

@@ -18,8 +18,8 @@ use crate::{
     models::{
         NetworkOptions, SETUP_COMMAND,
         manifest::{
-            Faults, FeaturesManifest, GeometryManifest, ImageTextManifest, MANIFEST, MasksManifest,
-            MatcherManifest, TextMasksManifest, is_plain, unavailable,
+            CamerasManifest, Faults, FeaturesManifest, GeometryManifest, ImageTextManifest,
+            MANIFEST, MasksManifest, MatcherManifest, TextMasksManifest, is_plain, unavailable,
         },
         onnx::OnnxHeader,
         places,
@@ -59,6 +59,7 @@ struct BundleManifest {
     text_masks: Option<TextMasksManifest>,
     features: Option<FeaturesManifest>,
     matcher: Option<MatcherManifest>,
+    cameras: Option<CamerasManifest>,
 }
 
 /// The keys of weights beside a network, `data` and `data_sha256`.
@@ -70,8 +71,8 @@ pub struct BundleFile<'a> {
     /// What it is for: `geometry`, `geometry.cpu`, `geometry.many`, `geometry.many.cpu`,
     /// `masks.encoder`, `masks.decoder`, `image_text.image`, `image_text.text`,
     /// `image_text.tokenizer`, `image_text.words`, `text_masks.image`, `text_masks.find`,
-    /// `text_masks.tokenizer`, `features`, `matcher`. A file of weights beside another has that
-    /// one's name.
+    /// `text_masks.tokenizer`, `features`, `matcher`, `cameras`. A file of weights beside another
+    /// has that one's name.
     pub part: &'static str,
     /// Name in the bundle's folder.
     pub file: &'a str,
@@ -161,6 +162,9 @@ impl Bundle {
         }
         if let Some(matcher) = &manifest.matcher {
             matcher.validate(manifest.features.is_some(), &mut faults);
+        }
+        if let Some(cameras) = &manifest.cameras {
+            cameras.validate(manifest.features.is_some(), &mut faults);
         }
         let sha256 = hex(&Sha256::digest(&text));
         let bundle = Self { dir: dir.to_owned(), sha256, manifest, words: Arc::default() };
@@ -276,6 +280,12 @@ impl Bundle {
         self.manifest.matcher.as_ref()
     }
 
+    /// The entry of the network that says where photos were taken; `None`: keypoints alone say it.
+    #[must_use]
+    pub fn cameras(&self) -> Option<&CamerasManifest> {
+        self.manifest.cameras.as_ref()
+    }
+
     /// What it lacks for semantics; `None` where nothing.
     #[must_use]
     pub fn lacks_semantics(&self) -> Option<&'static str> {
@@ -290,8 +300,8 @@ impl Bundle {
     /// Every file that the manifest names, itself left out.
     #[must_use]
     pub fn files<'a>(&'a self) -> Vec<BundleFile<'a>> {
-        let BundleManifest { geometry, masks, image_text, text_masks, features, matcher, .. } =
-            &self.manifest;
+        let BundleManifest { geometry, masks, image_text, text_masks, .. } = &self.manifest;
+        let BundleManifest { features, matcher, cameras, .. } = &self.manifest;
         let mut files = Vec::new();
         let mut network = |part, licence, [file, sha256]: [&'a str; 2], data: Data<'a>| {
             files.push(BundleFile { part, file, sha256, licence });
@@ -336,6 +346,9 @@ impl Bundle {
         }
         if let Some(m) = matcher {
             network("matcher", &m.licence, [&m.file, &m.sha256], [&m.data, &m.data_sha256]);
+        }
+        if let Some(c) = cameras {
+            network("cameras", &c.licence, [&c.file, &c.sha256], [&c.data, &c.data_sha256]);
         }
         files
     }

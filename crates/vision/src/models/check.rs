@@ -6,9 +6,11 @@ use std::{path::Path, time::Instant};
 use crate::{
     error::Result,
     models::{
-        Bundle, FeatureNetwork, Geometry, ImageText, MaskNetwork, MatcherNetwork, NetworkOptions,
-        ProviderChoice, Runtime, TextMaskNetwork, features, geometry, image_text, masks, matcher,
+        Bundle, CameraNetwork, FeatureNetwork, Geometry, ImageText, MaskNetwork, MatcherNetwork,
+        NetworkOptions, ProviderChoice, Runtime, TextMaskNetwork, cameras, features, geometry,
+        image_text, masks, matcher,
         network::{self, Signature},
+        onnx::OnnxHeader,
         text_masks,
     },
 };
@@ -37,6 +39,8 @@ pub struct CheckedFile {
     pub bytes: u64,
     /// Version of ONNX's operators, for a network.
     pub opset: Option<u64>,
+    /// Constants of 64-bit floats in a network. WebGPU opens none that has one.
+    pub doubles: usize,
     /// Whether it is the file of the manifest.
     pub fits: bool,
 }
@@ -52,12 +56,13 @@ pub fn check(dir: &Path, options: &NetworkOptions) -> Result<BundleCheck> {
     let mut files = Vec::new();
     for entry in bundle.files() {
         let header = bundle.verify_file(&entry);
-        let opset = header.as_ref().ok().and_then(|header| header.as_ref()?.opset());
+        let network = header.as_ref().ok().and_then(Option::as_ref);
         files.push(CheckedFile {
             part: entry.part,
             file: entry.file.to_owned(),
             bytes: bundle.size_bytes(entry.file),
-            opset,
+            opset: network.and_then(OnnxHeader::opset),
+            doubles: network.map_or(0, |header| header.doubles),
             fits: header.is_ok(),
         });
         faults.extend(header.err().map(|error| error.message().to_owned()));
@@ -128,6 +133,14 @@ pub fn check(dir: &Path, options: &NetworkOptions) -> Result<BundleCheck> {
                     )
                 });
             }
+        }
+        if let Some(manifest) = bundle.cameras() {
+            run("cameras", &cameras::signatures(manifest), &|| {
+                timed(
+                    || CameraNetwork::open(runtime, &bundle, options),
+                    |of| of.as_ref().map_or(Ok(()), CameraNetwork::try_out),
+                )
+            });
         }
     }
     let name = format!("{} {}", bundle.name(), bundle.version());

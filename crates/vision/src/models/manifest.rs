@@ -1,7 +1,7 @@
 //! The sections of `bundle.toml`: the geometry network, the mask network, the image and text
-//! towers, the network that masks what a text says, the feature network. `models/README.md` lists
-//! every key. A bundle without the second and third has no semantics; one without the last takes no
-//! photos without cameras.
+//! towers, the networks that mask what a text says, find keypoints, match them and guess cameras.
+//! `models/README.md` lists every key. A bundle without the second and third has no semantics; one
+//! without keypoints takes no photos without cameras.
 
 use std::{
     fmt::{Debug, Display},
@@ -22,7 +22,7 @@ pub(super) const MANIFEST: &str = "bundle.toml";
 /// Largest side of a bucket, pixels: `SourcePixel` counts in u16 and memory grows with the area.
 pub(super) const BUCKET_SIDE_MAX: u32 = 4_096;
 
-/// Views in one run of a geometry network.
+/// Views in one run of a geometry network, or of one that says where photos were taken.
 const VIEWS_MAX: usize = 64;
 /// Points along one side of the grid of prompts: 65,536 prompts a photo are minutes of work.
 const POINTS_PER_SIDE_MAX: u32 = 256;
@@ -759,6 +759,73 @@ impl MatcherManifest {
         faults.range("matcher.score_min", self.score_min, 0.0..=1.0);
         if !features {
             faults.wrong("matcher.file", &self.file, "have the section [features] beside it");
+        }
+    }
+}
+
+/// The network that says where photos were taken in `bundle.toml`.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CamerasManifest {
+    /// File in the bundle's folder.
+    pub file: String,
+    /// Its sha256, hex.
+    pub sha256: String,
+    /// File of the weights that are not in `file`.
+    pub data: Option<String>,
+    /// Its sha256, hex.
+    pub data_sha256: Option<String>,
+    /// Licence of the weights.
+    pub licence: String,
+    /// Where the weights come from.
+    pub source: String,
+    /// Input: `[V, 3, H, W]` f32, photos of one shape.
+    pub input: String,
+    /// Output: `[V, 3, 4]` f32, world to camera, of one world and scale.
+    pub world_to_camera: String,
+    /// Output: `[V, 3, 3]` f32, pixels of the input.
+    pub intrinsics: String,
+    /// Output: `[V, H, W]` f32, depths in the scale of the cameras; absent where the network gives
+    /// none. For callers that run the network by itself.
+    pub depth: Option<String>,
+    /// Output: `[V, H, W]` f32, how sure each depth is.
+    pub depth_confidence: Option<String>,
+    /// Most photos of a run.
+    pub views_max: usize,
+    /// Longer side of a photo, pixels.
+    pub side: u32,
+    /// Both sides of a photo are whole multiples of this, pixels.
+    pub cell: u32,
+    /// Filter that brings a photo to that size.
+    #[serde(default)]
+    pub resize: ResizeFilter,
+    /// Subtracted from the 0..1 channels.
+    pub mean: [f32; 3],
+    /// Divides them after that.
+    pub std: [f32; 3],
+    /// Most by which a device may differ from the CPU, root of mean squares, share of the answer.
+    #[serde(default = "defaults::tolerance")]
+    pub tolerance: f64,
+}
+
+impl CamerasManifest {
+    /// Width and height at which a photo of `[width, height]` pixels goes in.
+    #[must_use]
+    pub fn fitted(&self, photo: [u32; 2]) -> [u32; 2] {
+        in_cells(photo, self.side, self.cell)
+    }
+
+    /// `features`: whether the bundle has the network whose keypoints judge the cameras.
+    pub(super) fn validate(&self, features: bool, faults: &mut Faults) {
+        faults.file("cameras", &self.file, &self.sha256);
+        faults.data("cameras", &self.data, &self.data_sha256);
+        faults.range("cameras.views_max", self.views_max, 2..=VIEWS_MAX);
+        faults.range("cameras.cell", self.cell, 1..=BUCKET_SIDE_MAX);
+        faults.range("cameras.side", self.side, self.cell.max(1)..=BUCKET_SIDE_MAX);
+        faults.range("cameras.tolerance", self.tolerance, 0.0..=TOLERANCE_MAX);
+        faults.channels("cameras", self.mean, self.std);
+        if !features {
+            faults.wrong("cameras.file", &self.file, "have the section [features] beside it");
         }
     }
 }

@@ -211,6 +211,33 @@ impl Runner for Session {
     }
 }
 
+/// Held while anything is opened, run or closed on WebGPU.
+static ON_WEBGPU: Mutex<()> = Mutex::new(());
+
+/// A session on WebGPU. Its provider ends the process where two sessions run at once, of whatever
+/// networks (ONNX Runtime 1.31, issues 27592 and 32561 there), so all of them take turns.
+#[derive(Debug)]
+struct InTurn(Option<Box<dyn Runner>>);
+
+impl Runner for InTurn {
+    fn run(
+        &mut self,
+        inputs: &[Input<'_>],
+        only: &[&str],
+        read: &mut Read<'_>,
+    ) -> std::result::Result<(), Failure> {
+        let _turn = ON_WEBGPU.lock();
+        self.0.as_mut().map_or(Ok(()), |runner| runner.run(inputs, only, read))
+    }
+}
+
+impl Drop for InTurn {
+    fn drop(&mut self) {
+        let _turn = ON_WEBGPU.lock();
+        drop(self.0.take());
+    }
+}
+
 /// Sessions of one network, lent one at a time.
 #[derive(Debug)]
 struct Pool {
@@ -549,10 +576,15 @@ impl Opener {
             let keeps_memory = self.memory.is_kept_on(provider);
             self.runtime.session(file, provider, threads, weights, arithmetic, keeps_memory)
         };
+        let turn = (provider == Provider::Webgpu).then(|| ON_WEBGPU.lock());
         let sessions: Vec<Session> = (0..count).map(session).collect::<ort::Result<_>>()?;
+        drop(turn);
         let file = sessions.first().map(FileSignature::of).unwrap_or_default();
-        let runners = sessions.into_iter().map(|session| Box::new(session) as Box<dyn Runner>);
-        Ok((Pool::new(runners.collect()), file))
+        let runner = |session| match provider {
+            Provider::Webgpu => Box::new(InTurn(Some(Box::new(session)))) as Box<dyn Runner>,
+            Provider::Cpu | Provider::Cuda => Box::new(session),
+        };
+        Ok((Pool::new(sessions.into_iter().map(runner).collect()), file))
     }
 
     /// The CPU's own answer in f32 from the file that devices run.
@@ -967,6 +999,29 @@ mod tests {
         };
         let sessions = pool(found.iter().map(|found| Some(*found)));
         check(&spec, "cuda", &sessions, &pool([Some(wanted)]), &[])
+    }
+
+    #[test]
+    fn sessions_on_webgpu_run_one_at_a_time() {
+        let (running, most) = (AtomicU32::new(0), AtomicU32::new(0));
+        std::thread::scope(|threads| {
+            for _ in 0..4 {
+                threads.spawn(|| {
+                    let mut session = InTurn(Some(Box::new(Fake(Some(1.0)))));
+                    let mut read = |_: &dyn Outputs| {
+                        most.fetch_max(
+                            running.fetch_add(1, Ordering::SeqCst) + 1,
+                            Ordering::SeqCst,
+                        );
+                        std::thread::sleep(std::time::Duration::from_millis(20));
+                        running.fetch_sub(1, Ordering::SeqCst);
+                        Ok(())
+                    };
+                    session.run(&[], &[], &mut read).unwrap();
+                });
+            }
+        });
+        assert_eq!(most.into_inner(), 1);
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! What an ONNX file says of itself, read without its weights: opsets and files of external data.
+//! What an ONNX file says of itself, read without its weights: opsets, files of external data, and
+//! tensors that GPUs do not take.
 //!
 //! The reader walks the protobuf's fields and skips over the numbers, so that a file of 2 GiB takes
 //! a few kilobytes of memory. Field numbers are those of `onnx.proto`.
@@ -13,14 +14,18 @@ use std::{
 const DEPTH_MAX: u32 = 32;
 /// Longest name that is read, bytes.
 const NAME_BYTES_MAX: u64 = 4_096;
+/// `TensorProto.DataType` of 64-bit floats.
+const DOUBLE: u64 = 11;
 
-/// Opsets and external files of a network.
+/// Opsets, external files and 64-bit tensors of a network.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct OnnxHeader {
     /// Version of the operators of each domain; the empty name is ONNX's own.
     pub(super) opsets: BTreeMap<String, u64>,
     /// Files, relative to the network's own, that hold weights.
     pub(super) external: BTreeSet<String>,
+    /// Constants of 64-bit floats. WebGPU has none, and a network with one does not open there.
+    pub(super) doubles: usize,
 }
 
 impl OnnxHeader {
@@ -91,8 +96,10 @@ impl Fields {
             let (field, length) = match tag & 7 {
                 0 => {
                     let value = self.varint()?;
-                    if matches!(of, Message::Opset) && tag >> 3 == 2 {
-                        version = value;
+                    match (of, tag >> 3) {
+                        (Message::Opset, 2) => version = value,
+                        (Message::Tensor, 2) if value == DOUBLE => found.doubles += 1,
+                        _ => {}
                     }
                     continue;
                 }
@@ -191,10 +198,10 @@ mod tests {
 
     #[test]
     fn opsets_and_external_files_are_found_between_other_fields() {
-        // ir_version 8; graph { initializer { dims 2, raw_data 3 bytes, external_data { location:
-        // "w.data" } } }; opset { domain "a", version 300 }; opset { version 17 }.
+        // ir_version 8; graph { initializer { dims 2, data_type 11, raw_data 3 bytes, external_data {
+        // location: "w.data" } } }; opset { domain "a", version 300 }; opset { version 17 }.
         let entry = b"\x0a\x08location\x12\x06w.data";
-        let mut tensor = b"\x08\x02\x4a\x03abc\x6a".to_vec();
+        let mut tensor = b"\x08\x02\x10\x0b\x4a\x03abc\x6a".to_vec();
         tensor.push(entry.len() as u8);
         tensor.extend(entry);
         let mut graph = vec![0x2a, tensor.len() as u8];
@@ -206,11 +213,25 @@ mod tests {
         let found = read(&model).unwrap();
         assert_eq!(found.opsets, [("a".to_owned(), 300), (String::new(), 17)].into());
         assert_eq!(found.external, ["w.data".to_owned()].into());
+        assert_eq!(found.doubles, 1);
         for cut in 0..model.len() - 12 {
             assert!(read(&model[..cut]).is_err(), "the first {cut} bytes");
         }
         // A field that claims more than there is takes no memory.
         assert!(read(b"\x3a\xff\xff\xff\xff\xff\xff\xff\xff\x7f").is_err(), "a graph of 2^63");
         assert!(read(b"\x42\xff\xff\xff\xff\x07\x0a\xff\xff\xff\xff\x06").is_err(), "a long name");
+    }
+
+    #[test]
+    fn no_network_of_the_embedded_bundle_has_64_bit_floats() {
+        let of = |entry: std::io::Result<std::fs::DirEntry>| entry.unwrap().path();
+        let files = std::fs::read_dir(segsplat_testing::root().join("models/embedded")).unwrap();
+        let networks: Vec<_> =
+            files.map(of).filter(|p| p.extension() == Some("onnx".as_ref())).collect();
+        assert!(networks.len() > 8, "{networks:?}");
+        for path in networks {
+            let found = OnnxHeader::read(&path).unwrap();
+            assert_eq!(found.doubles, 0, "{}: WebGPU does not open it", path.display());
+        }
     }
 }

@@ -1,7 +1,9 @@
 //! The cameras of photos that came without: keypoints ▸ matches ▸ `segsplat_cameras` ▸ judge.
 //!
-//! The solver sees keypoints alone. The judge is the plane sweep of `capture`, which compares the
-//! photos' pixels under the cameras: what it calls wrong of given cameras refuses solved ones.
+//! The solver sees keypoints, and what a network says of the cameras where the bundle has one: a
+//! guess, which it begins with and which keypoints judge. The judge of all is the plane sweep of
+//! `capture`, which compares the photos' pixels under the cameras: what it calls wrong of given
+//! cameras refuses solved ones.
 
 use std::{
     collections::HashSet,
@@ -30,7 +32,7 @@ use crate::{
     formats::captures::FIND_CAMERAS,
     matching::{Descriptors, KeypointPair},
     meter,
-    models::{FeatureNetwork, MatcherNetwork, PhotoFeatures, SureMatch},
+    models::{CameraNetwork, FeatureNetwork, MatcherNetwork, PhotoFeatures, SureMatch},
     photos,
     scene::{
         Camera, CameraToWorld, CamerasReport, CamerasSource, LeftOutPhoto, Photo, PlacedPhoto,
@@ -103,6 +105,15 @@ impl Pipeline {
         let open = || MatcherNetwork::open(&self.runtime, &self.bundle, &self.lazy.options);
         opened(&self.lazy.matcher, "network that matches keypoints", open).map(Some)
     }
+
+    /// The network that says where photos were taken, opened at the first call.
+    ///
+    /// # Errors
+    /// `model_unavailable` when the bundle has none or it does not open.
+    pub fn cameras(&self) -> Result<Arc<CameraNetwork>> {
+        let open = || CameraNetwork::open(&self.runtime, &self.bundle, &self.lazy.options);
+        opened(&self.lazy.cameras, "network that says where photos were taken", open)
+    }
 }
 
 /// Finds the cameras of photos: the stage [`Stage::Cameras`]. Photos without one are left out.
@@ -115,7 +126,8 @@ pub fn posed(pipeline: &Pipeline, set: UnposedSet, watch: Watch<'_>) -> Result<P
     unless_cancelled(watch.cancel)?;
     let _span = tracing::info_span!("stage", stage = Stage::Cameras.name()).entered();
     let UnposedSet { photos, mut warnings, read_ms } = set;
-    let solution = solved(pipeline, &photos, watch)?;
+    let guesses = guessed(pipeline, &photos)?;
+    let solution = solved(pipeline, &photos, &guesses, watch)?;
     let confirmed = confirmed(pipeline, photos, &solution, watch)?;
     let Confirmed { photos, cameras, doubts } = confirmed;
     warnings.extend(left_out(&cameras.left_out));
@@ -128,16 +140,31 @@ pub fn posed(pipeline: &Pipeline, set: UnposedSet, watch: Watch<'_>) -> Result<P
     Ok(PhotoSet { photos, warnings, stages, cameras, is_without_words: false })
 }
 
-/// What [`posed`] finds, and whether it would refuse it.
+/// What a network says of the cameras of photos, in a world of its own; nothing where the bundle
+/// has none.
+///
+/// # Errors
+/// `internal`; `model_unavailable` where the network does not open.
+pub fn guessed(pipeline: &Pipeline, photos: &[UnposedPhoto]) -> Result<Vec<Option<Camera>>> {
+    if pipeline.bundle.cameras().is_none() {
+        return Ok(vec![None; photos.len()]);
+    }
+    let network = pipeline.cameras()?;
+    let photos: Vec<&Photo> = photos.iter().map(|unposed| &unposed.photo).collect();
+    pipeline.workers.install(|| network.find(&photos))
+}
+
+/// What [`posed`] finds from these guesses, and whether it would refuse it.
 ///
 /// # Errors
 /// As [`posed`], but for `cameras_unsolved`.
 pub fn judged(
     pipeline: &Pipeline,
     photos: &[UnposedPhoto],
+    guesses: &[Option<Camera>],
     watch: Watch<'_>,
 ) -> Result<JudgedCameras> {
-    let solution = solved(pipeline, photos, watch)?;
+    let solution = solved(pipeline, photos, guesses, watch)?;
     let refused = match confirmed(pipeline, photos.to_vec(), &solution, watch) {
         Ok(_) => None,
         Err(e) if e.code() == ErrorCode::CamerasUnsolved => Some(e.message().to_owned()),
@@ -188,12 +215,18 @@ pub fn recast(
 }
 
 /// The solver's answer.
-fn solved(pipeline: &Pipeline, photos: &[UnposedPhoto], watch: Watch<'_>) -> Result<Solution> {
+fn solved(
+    pipeline: &Pipeline,
+    photos: &[UnposedPhoto],
+    guesses: &[Option<Camera>],
+    watch: Watch<'_>,
+) -> Result<Solution> {
     let Watch { progress, cancel } = watch;
     let tell = |fraction: f32| progress(Stage::Cameras, fraction);
     let pixels: Vec<(&Photo, Option<f64>)> =
         photos.iter().map(|unposed| (&unposed.photo, unposed.focal)).collect();
-    let (keypoints, matches) = matched(pipeline, &pixels, watch)?;
+    let (mut keypoints, matches) = matched(pipeline, &pixels, watch)?;
+    keypoints.iter_mut().zip(guesses).for_each(|(photo, guess)| photo.guess = *guess);
     let options = SolveOptions {
         photos_max: photos.len(),
         keypoints_max: pipeline.features()?.manifest().count,
@@ -247,7 +280,7 @@ fn matched(
     tell(MATCHES_END);
     let of_photo = |(found, (photo, focal)): (PhotoFeatures, &(&Photo, Option<f64>))| {
         let (size, keypoints) = ([photo.width, photo.height], found.keypoints);
-        PhotoKeypoints { size, focal: *focal, keypoints, seconds: None }
+        PhotoKeypoints { size, focal: *focal, keypoints, ..PhotoKeypoints::default() }
     };
     Ok((seen.into_iter().zip(photos).map(of_photo).collect(), matches))
 }

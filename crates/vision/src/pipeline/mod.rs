@@ -47,13 +47,14 @@ use crate::{
 };
 
 /// Parts of a bundle that are networks of their own, where it has them, and that callers may run.
-pub const NETWORKS: [&str; 6] = [
+pub const NETWORKS: [&str; 7] = [
     "geometry",
     "geometry.many",
     "masks.encoder",
     "masks.decoder",
     "image_text.image",
     "image_text.text",
+    "cameras",
 ];
 
 /// Views that go through the geometry network together, where none are asked for: memory grows with
@@ -143,6 +144,7 @@ impl Pipeline {
             "masks.decoder" => work(self.masks()?.decoder()),
             "image_text.image" => work(self.image_text()?.image_tower()),
             "image_text.text" => work(self.image_text()?.text_tower()),
+            "cameras" => work(self.cameras()?.network()),
             _ => match self.geometry.network(part) {
                 Some(network) => work(network),
                 None => Err(Error::new(ErrorCode::NotFound, "no network of this name")),

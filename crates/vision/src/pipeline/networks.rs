@@ -7,7 +7,8 @@ use parking_lot::Mutex;
 use crate::{
     error::{Error, ErrorCode, Result},
     models::{
-        FeatureNetwork, ImageText, MaskNetwork, MatcherNetwork, NetworkOptions, TextMaskNetwork,
+        CameraNetwork, FeatureNetwork, ImageText, MaskNetwork, MatcherNetwork, NetworkOptions,
+        TextMaskNetwork,
     },
 };
 
@@ -20,13 +21,14 @@ pub(super) struct LazyNetworks {
     pub(super) text_masks: Mutex<Option<Arc<TextMaskNetwork>>>,
     pub(super) features: Mutex<Option<Arc<FeatureNetwork>>>,
     pub(super) matcher: Mutex<Option<Arc<MatcherNetwork>>>,
+    pub(super) cameras: Mutex<Option<Arc<CameraNetwork>>>,
 }
 
 impl LazyNetworks {
     pub(super) fn new(options: &NetworkOptions) -> Self {
         let options = options.clone();
-        let (masks, image_text, text_masks, features, matcher) = Default::default();
-        Self { options, masks, image_text, text_masks, features, matcher }
+        let (masks, image_text, text_masks, features, matcher, cameras) = Default::default();
+        Self { options, masks, image_text, text_masks, features, matcher, cameras }
     }
 
     /// Why an open network is not computed where it was to be; one that is being opened says
@@ -36,6 +38,7 @@ impl LazyNetworks {
         masks()
             .or_else(|| self.image_text.try_lock()?.as_ref()?.remark())
             .or_else(|| self.text_masks.try_lock()?.as_ref()?.remark())
+            .or_else(|| self.cameras.try_lock()?.as_ref()?.remark())
     }
 }
 

@@ -13,6 +13,7 @@ mod backdrop;
 mod bank;
 mod bitset;
 mod bundle;
+mod cameras;
 mod capture;
 mod captures;
 mod cases;
