@@ -198,8 +198,9 @@ mod tests {
 
     #[test]
     fn opsets_and_external_files_are_found_between_other_fields() {
-        // ir_version 8; graph { initializer { dims 2, data_type 11, raw_data 3 bytes, external_data {
-        // location: "w.data" } } }; opset { domain "a", version 300 }; opset { version 17 }.
+        // ir_version 8; graph { initializer { dims 2, data_type 11, raw_data 3 bytes,
+        // external_data { location: "w.data" } } }; opset { domain "a", version 300 };
+        // opset { version 17 }.
         let entry = b"\x0a\x08location\x12\x06w.data";
         let mut tensor = b"\x08\x02\x10\x0b\x4a\x03abc\x6a".to_vec();
         tensor.push(entry.len() as u8);
