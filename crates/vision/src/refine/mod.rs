@@ -152,7 +152,7 @@ pub struct RefineOptions {
     pub ssim_share: f32,
     /// Chance of each Gaussian to be left out of a step, but not of the last ones
     /// ([`segsplat_render::Dropout`]); of [`crate::pipeline::refinement::refined`] from the second
-    /// part on. Chosen on the five scenes that docs/adr/0110 names.
+    /// part on. 0 unless asked for: docs/adr/0110 says which scenes it helps and which it costs.
     pub dropout: f32,
     /// How far cameras turn in a step at first, radians, and move, as a share of the scene's median
     /// depth; 0: they stay where they are.
@@ -197,7 +197,7 @@ impl Default for RefineOptions {
             opacity_min: 0.01,
             prune_every: 50,
             ssim_share: 0.2,
-            dropout: 0.15,
+            dropout: 0.0,
             pose_rate: 1e-3,
             mends_from: 0.25,
             first_steps: 400,
