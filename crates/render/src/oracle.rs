@@ -296,9 +296,9 @@ pub fn splat(
 /// Whether Gaussian `i` is left out by chance, in whole numbers under 2³².
 fn is_left_out(i: usize, dropout: Dropout) -> bool {
     let mixed = |x: u64| {
-        let x = ((x ^ (x / 65_536)) * 2_146_121_005) % (1 << 32);
-        let x = ((x ^ (x / 32_768)) * 2_221_713_035) % (1 << 32);
-        x ^ (x / 65_536)
+        let x = ((x ^ x / 65_536) * 2_146_121_005) % (1 << 32);
+        let x = ((x ^ x / 32_768) * 2_221_713_035) % (1 << 32);
+        x ^ x / 65_536
     };
     let word = u64::from(dropout.word());
     let chance = word / (1 << 24);
