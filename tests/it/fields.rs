@@ -14,7 +14,7 @@ async fn messages_name_the_field_the_value_and_what_it_must_be() {
     let stand = CpuServer::start().await;
     let client = crate::common::client();
     let numbers = "it must have 3, separated by commas";
-    let kinds = "color, depth, alpha, semantics, relevancy or mask";
+    let kinds = "color, depth, alpha, holes, semantics, relevancy or mask";
     for (query, want) in [
         ("view?from=0&width=abc", "width is \"abc\"; it must be a whole number".to_owned()),
         (
