@@ -238,35 +238,50 @@ impl Drop for InTurn {
     }
 }
 
+/// Sizes of the inputs of a run.
+type Shapes = Vec<Vec<usize>>;
+
+/// A session, and the shapes of its last run.
+#[derive(Debug)]
+struct Kept {
+    runner: Box<dyn Runner>,
+    shapes: Shapes,
+}
+
 /// Sessions of one network, lent one at a time.
 #[derive(Debug)]
 struct Pool {
-    idle: Mutex<Vec<Box<dyn Runner>>>,
+    /// The one that came back last is last.
+    idle: Mutex<Vec<Kept>>,
     returned: Condvar,
 }
 
 impl Pool {
     fn new(runners: Vec<Box<dyn Runner>>) -> Self {
-        Self { idle: Mutex::new(runners), returned: Condvar::new() }
+        let kept = |runner| Kept { runner, shapes: Shapes::new() };
+        let idle = Mutex::new(runners.into_iter().map(kept).collect());
+        Self { idle, returned: Condvar::new() }
     }
 
-    /// Runs on an idle session, and waits for one.
+    /// Runs on an idle session, and waits for one. One whose last run had the same shapes goes
+    /// first, for a device looks for its fastest kernels again wherever they change (1 to 2 s of an
+    /// image tower on CUDA); else the one that is idle for longest.
     fn run(
         &self,
         inputs: &[Input<'_>],
         only: &[&str],
         read: &mut Read<'_>,
     ) -> std::result::Result<(), Failure> {
+        let shapes: Shapes = inputs.iter().map(|input| input.shape.clone()).collect();
         let mut idle = self.idle.lock();
-        let runner = loop {
-            match idle.pop() {
-                Some(runner) => break runner,
-                None => self.returned.wait(&mut idle),
-            }
-        };
+        while idle.is_empty() {
+            self.returned.wait(&mut idle);
+        }
+        let same = idle.iter().position(|kept| kept.shapes == shapes);
+        let kept = idle.remove(same.unwrap_or(0));
         drop(idle);
-        let mut lent = Lent { pool: self, runner: Some(runner) };
-        lent.runner.as_mut().map_or(Ok(()), |runner| runner.run(inputs, only, read))
+        let mut lent = Lent { pool: self, kept: Some(Kept { shapes, ..kept }) };
+        lent.kept.as_mut().map_or(Ok(()), |kept| kept.runner.run(inputs, only, read))
     }
 
     /// Runs on every session, one after the other; for a pool that is not in use yet.
@@ -276,19 +291,19 @@ impl Pool {
         only: &[&str],
         read: &mut Read<'_>,
     ) -> std::result::Result<(), Failure> {
-        self.idle.lock().iter_mut().try_for_each(|runner| runner.run(inputs, only, read))
+        self.idle.lock().iter_mut().try_for_each(|kept| kept.runner.run(inputs, only, read))
     }
 }
 
 /// A borrowed session; goes back when dropped.
 struct Lent<'a> {
     pool: &'a Pool,
-    runner: Option<Box<dyn Runner>>,
+    kept: Option<Kept>,
 }
 
 impl Drop for Lent<'_> {
     fn drop(&mut self) {
-        self.pool.idle.lock().extend(self.runner.take());
+        self.pool.idle.lock().extend(self.kept.take());
         self.pool.returned.notify_one();
     }
 }
@@ -1022,6 +1037,37 @@ mod tests {
             }
         });
         assert_eq!(most.into_inner(), 1);
+    }
+
+    /// Counts runs whose shapes are others than those of its run before.
+    #[derive(Debug)]
+    struct Searching(Option<usize>, Arc<AtomicU32>);
+
+    impl Runner for Searching {
+        fn run(
+            &mut self,
+            inputs: &[Input<'_>],
+            _: &[&str],
+            _: &mut Read<'_>,
+        ) -> std::result::Result<(), Failure> {
+            let size = inputs.first().map(|input| input.shape[0]);
+            if std::mem::replace(&mut self.0, size) != size {
+                self.1.fetch_add(1, Ordering::SeqCst);
+            }
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn runs_of_other_shapes_have_other_sessions() {
+        let searches = Arc::new(AtomicU32::new(0));
+        let session = || Box::new(Searching(None, Arc::clone(&searches))) as Box<dyn Runner>;
+        let pool = Pool::new(vec![session(), session(), session()]);
+        for size in [1, 16].repeat(5).into_iter().chain([4, 1, 16, 4]) {
+            let input = Input::new("images", &[size], vec![0.0_f32; size]);
+            pool.run(&[input], &[], &mut |_| Ok(())).unwrap();
+        }
+        assert_eq!(searches.load(Ordering::SeqCst), 3, "one for each shape");
     }
 
     #[test]
