@@ -47,7 +47,7 @@ fn project_one(i: u32) -> Footprint {
     let gaussian = gaussian_of(gaussians[i]);
     let t = camera_point(gaussian.mean);
     var footprint = Footprint(vec2(0.0), 0.0, 0.0, 0.0, 0.0, 0.0, t.z);
-    if !(t.z >= views[which].near && is_finite(t.z)) || leaves_out(i) {
+    if !(t.z >= views[which].near && is_finite(t.z)) {
         return footprint;
     }
     var scale = gaussian.scale;

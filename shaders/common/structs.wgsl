@@ -85,9 +85,8 @@ struct View {
     block_count: u32,
     // How far a Gaussian may be from the merged one that stands for it, for each unit of depth.
     detail: f32,
-    // Gaussians that are left out by chance: the chance in the upper 8 bits, in steps of 1/256, and
-    // a seed; 0: none.
-    dropout: u32,
+    // Not used: a row has a multiple of four.
+    rest: u32,
 }
 
 // A photo that Gaussians were seen in.

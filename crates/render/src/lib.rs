@@ -18,7 +18,6 @@ pub mod coarse;
 pub mod compare;
 pub mod constants;
 pub mod cpu;
-mod dropout;
 pub mod gpu;
 pub mod labels;
 pub mod levels;
@@ -45,7 +44,6 @@ pub use segsplat_core::scene::PixelWeights;
 #[cfg(feature = "testing")]
 pub use self::switches::{Skip, Switches};
 pub use self::{
-    dropout::Dropout,
     labels::Labels,
     levels::{DepthSteps, Levels},
     options::{RendererChoice, RendererOptions},
@@ -181,8 +179,6 @@ pub struct RenderRequest {
     /// one may be from the one that stands for it, 0 to [`merged::DETAIL_MAX`]. At 0 none are
     /// drawn. `error` says nothing of what they change.
     pub detail: f32,
-    /// Gaussians that are left out by chance, as steps of training ask for.
-    pub dropout: Dropout,
 }
 
 impl RenderRequest {
@@ -201,7 +197,6 @@ impl RenderRequest {
             near,
             error: 0.0,
             detail: 0.0,
-            dropout: Dropout::NONE,
         }
     }
 

@@ -11,7 +11,7 @@ use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::{
-    Background, Dropout, Labels, Layer, RenderRequest, Source,
+    Background, Labels, Layer, RenderRequest, Source,
     constants::{
         ALPHA_MAX, ALPHA_MIN, BLUR_PX2, FRUSTUM_MARGIN, OWN_SIZE, PIXEL_PX2, SH_C0, SH_C1, SH_C2,
         SH_C3, SH_OFFSET, TRANSMITTANCE_MIN,
@@ -293,18 +293,6 @@ pub fn splat(
     splat_of(gaussians, i, 0.0, request, lens)
 }
 
-/// Whether Gaussian `i` is left out by chance, in whole numbers under 2³².
-fn is_left_out(i: usize, dropout: Dropout) -> bool {
-    let mixed = |x: u64| {
-        let x = ((x ^ x / 65_536) * 2_146_121_005) % (1 << 32);
-        let x = ((x ^ x / 32_768) * 2_221_713_035) % (1 << 32);
-        x ^ x / 65_536
-    };
-    let word = u64::from(dropout.word());
-    let chance = word / (1 << 24);
-    chance > 0 && mixed(i as u64 ^ mixed(word)) / (1 << 24) < chance
-}
-
 /// The same of one that stands for Gaussians whose opacities have this sum; 0: for none.
 fn splat_of(
     gaussians: &Gaussians,
@@ -313,9 +301,6 @@ fn splat_of(
     request: &RenderRequest,
     lens: &Intrinsics,
 ) -> Option<Splat> {
-    if is_left_out(i, request.dropout) {
-        return None;
-    }
     let pose = request.camera.camera_to_world;
     let mean = DVec3::from(gaussians.means()[i].map(f64::from));
     let from_eye = mean - (pose.center() - gaussians.origin());

@@ -15,7 +15,7 @@ use super::{
     tiles::{BLOCK, Ellipses, Grid, TileSpans},
 };
 use crate::{
-    Dropout, Layer, RenderRequest, Source,
+    Layer, RenderRequest, Source,
     constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK, OWN_SIZE, PIXEL_PX2},
     scene::Gaussians,
     view::View,
@@ -108,10 +108,7 @@ impl LaneKernel for Chunk<'_> {
             let places = first..first + footprints.len();
             block.load(self.gaussians, self.shown, places.clone());
             if magnifies {
-                block.load_widths(self.gaussians, self.shown, places.clone(), &request.sources);
-            }
-            if request.dropout != Dropout::NONE {
-                block.leave_out(self.shown, places, request.dropout);
+                block.load_widths(self.gaussians, self.shown, places, &request.sources);
             }
             if !block.project(simd, view, block_options) {
                 continue;
@@ -225,16 +222,6 @@ impl Block {
                     // It reaches no bound, whatever is made of it.
                     self.opacity[k] = f64::NAN;
                 }
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn leave_out(&mut self, shown: &Shown, places: Range<usize>, dropout: Dropout) {
-        for (opacity, at) in self.opacity.iter_mut().zip(places) {
-            if dropout.leaves_out(shown.id(at) as u32) {
-                // It reaches no bound.
-                *opacity = f64::NAN;
             }
         }
     }

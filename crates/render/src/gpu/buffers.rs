@@ -78,7 +78,7 @@ pub struct ViewRow {
     pub photos_widen: f32,
     pub block_count: u32,
     pub detail: f32,
-    pub dropout: u32,
+    pub rest: u32,
 }
 
 /// `Source` of the shaders.
@@ -262,7 +262,6 @@ impl ViewRow {
             photos: wide(frustum.photos),
             photos_widen: frustum.widens as f32,
             detail: frustum.detail as f32,
-            dropout: request.dropout.word(),
             ..Self::new(view, background, request.antialiased)
         }
     }

@@ -92,7 +92,7 @@ macro_rules! shader {
 /// Every shader, in the order of the stages.
 pub const SHADERS: [Shader; 17] = [
     shader!("cull", "cull"),
-    shader!("project", "project", "rows", "camera", "tiles", "dropout"),
+    shader!("project", "project", "rows", "camera", "tiles"),
     shader!("shade", "shade", "rows", "sh"),
     shader!("prefix_sum", "prefix_sum", "sum_before"),
     shader!("emit_isects", "emit_isects", "rows", "tiles"),

@@ -296,7 +296,6 @@ impl DeviceTrainer {
         let PhotoStep { at, step, adds, moves, blames } = photo_step;
         let mut target = self.targets.get(at).ok_or_else(|| absent(at))?.clone();
         target.request.camera.camera_to_world = self.poses[target.pose].now;
-        target.request.dropout = step.dropout;
         if let Some(photo) = &target.streamed {
             let pixels = rgba_of(&photo.read()?);
             let (to, at) = (&self.training.photos, 4 * u64::from(target.start));
@@ -382,7 +381,7 @@ impl DeviceTrainer {
     /// How much each place is to blame for how the scene differs from the photos.
     fn blame(&mut self, photos: &[usize]) -> Result<Vec<f32>> {
         let earlier = self.earlier()?;
-        // Nothing moves, and all are blamed.
+        // Nothing moves.
         let rates = LearningRates::default().scaled(0.0);
         let step = TrainingStep { rates, ..TrainingStep::default() };
         for (place, &at) in photos.iter().enumerate() {

@@ -155,8 +155,7 @@ impl Trainer for HostTrainer<'_> {
         let Self { renderer, gaussians, adam, targets, poses, ssim_share, found, .. } = self;
         for (place, &at) in photos.iter().enumerate() {
             let target = targets.get_mut(at).ok_or_else(|| absent(at))?;
-            let (view, photo) = (target.view(poses), target.pixels()?);
-            let request = RenderRequest { dropout: step.dropout, ..view };
+            let (request, photo) = (target.view(poses), target.pixels()?);
             let mut loss =
                 |frame: &Frame| Ok(target.compare(&photo, frame, *ssim_share, step.exposure));
             let into = if place == 0 { &mut found.0 } else { &mut found.1 };

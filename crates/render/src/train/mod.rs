@@ -25,7 +25,7 @@ pub use self::{
     streamed::{PhotoSource, StreamedPhoto},
 };
 use crate::{
-    Dropout, Frame, RenderRequest,
+    Frame, RenderRequest,
     error::{Error, Result},
     scene::{CameraToWorld, Gaussians, Photo},
 };
@@ -111,9 +111,6 @@ pub struct TrainingStep {
     pub poses: PoseRates,
     /// Gaussians under this opacity are dropped after the step; 0 drops none.
     pub opacity_min: f32,
-    /// Gaussians that the step leaves out: it neither draws nor moves them. Their numbers are those
-    /// of [`Trainer::gaussians`] until some are dropped or added; then each trainer has its own.
-    pub dropout: Dropout,
 }
 
 /// A place where steps are taken. Twins: from the same start they come to the same numbers, to the

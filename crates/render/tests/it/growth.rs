@@ -2,7 +2,7 @@
 
 use segsplat_core::scene::{Gaussians, Photo, RawGaussians, SourcePixel};
 use segsplat_render::{
-    DifferentiableRenderer as _, Dropout, RenderRequest, Renderer as _,
+    DifferentiableRenderer as _, RenderRequest, Renderer as _,
     train::{
         HostTrainer, LearningRates, PoseRates, Trainer, TrainingPhoto, TrainingSet, TrainingStep,
     },
@@ -11,13 +11,8 @@ use segsplat_testing::scenes::{camera, checked, cloud, push, request};
 
 use crate::common::{both_kernels, cpu};
 
-const STEP: TrainingStep = TrainingStep {
-    rates: RATES,
-    exposure: 5e-3,
-    poses: STILL,
-    opacity_min: 0.0,
-    dropout: Dropout::NONE,
-};
+const STEP: TrainingStep =
+    TrainingStep { rates: RATES, exposure: 5e-3, poses: STILL, opacity_min: 0.0 };
 const STILL: PoseRates = PoseRates { turn: 0.0, shift: 0.0 };
 const RATES: LearningRates = LearningRates {
     means: 1e-3,

@@ -147,7 +147,7 @@ fn structs_lie_in_memory_as_the_shaders_say() {
                 photos_widen,
                 block_count,
                 detail,
-                dropout,
+                rest,
             ]
         ),
         layout!(BlockRow, "Block", [center, reach, half, error, parent, rest]),

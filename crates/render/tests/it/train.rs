@@ -6,7 +6,7 @@ use segsplat_core::{
     scene::{Gaussians, Photo},
 };
 use segsplat_render::{
-    Background, DifferentiableRenderer, Dropout, Kinds, RenderRequest, Renderer as _,
+    Background, DifferentiableRenderer, Kinds, RenderRequest, Renderer as _,
     gpu::GpuRenderer,
     train::{HostTrainer, Trainer, TrainingPhoto, TrainingSet, TrainingStep, photo_loss, unit},
 };
@@ -183,7 +183,7 @@ pub(crate) fn kinds(gaussians: &Gaussians) -> [(&'static str, Vec<f32>); 5] {
     ]
 }
 
-type Steps<'a> = &'a [(&'a [usize], TrainingStep)];
+type Steps<'a> = &'a [(&'a [usize], f32)];
 
 /// The trainer of `gpu` against that of the processor over the same renderer, after `steps`.
 fn judge(gpu: &GpuRenderer, name: &str, set: &TrainingSet<'_>, steps: Steps<'_>) {
@@ -194,11 +194,11 @@ fn judge(gpu: &GpuRenderer, name: &str, set: &TrainingSet<'_>, steps: Steps<'_>)
 fn judge_order(gpu: &GpuRenderer, name: &str, set: &TrainingSet<'_>, steps: [Steps<'_>; 2]) {
     let mut device = gpu.trainer(set, u64::MAX).expect("room").expect("a trainer");
     let mut host = HostTrainer::new(gpu, set).expect("a trainer");
-    for (photos, step) in steps[0] {
-        device.step(photos, step).expect("a step of the device");
+    for (photos, opacity_min) in steps[0] {
+        device.step(photos, &step(*opacity_min)).expect("a step of the device");
     }
-    for (photos, step) in steps[1] {
-        host.step(photos, step).expect("a step of the processor");
+    for (photos, opacity_min) in steps[1] {
+        host.step(photos, &step(*opacity_min)).expect("a step of the processor");
     }
     let (got, want) = (device.gaussians().unwrap(), host.gaussians().unwrap());
     assert_eq!(got.len(), want.len(), "{name}: Gaussians that are left");
@@ -238,56 +238,12 @@ fn the_trainer_of_a_device_takes_the_steps_of_the_processor() {
             let truth = cloud(1_500, degree, 5);
             let (start, photos) = (disturbed(&truth), photos(&truth, &[[75, 50], [64, 48]]));
             let set = set(&start, &photos);
-            let five = |step: fn(u32) -> TrainingStep| -> [(&[usize], TrainingStep); 5] {
-                [
-                    (&[0], step(0)),
-                    (&[1], step(1)),
-                    (&[0], step(2)),
-                    (&[1], step(3)),
-                    (&[0], step(4)),
-                ]
-            };
-            judge(gpu, "one photo a step", &set, &five(|_| step(0.0)));
-            judge(gpu, "some left out of each step", &set, &five(leaving_out));
-            judge(gpu, "two photos a step", &set, &[(&[0, 1], step(0.0)), (&[1, 0], step(0.0))]);
-            judge(
-                gpu,
-                "dropping",
-                &set,
-                &[(&[0], step(0.0)), (&[1], step(0.1)), (&[0], step(0.0)), (&[1], step(0.0))],
-            );
+            let steps: [(&[usize], f32); 5] =
+                [(&[0], 0.0), (&[1], 0.0), (&[0], 0.0), (&[1], 0.0), (&[0], 0.0)];
+            judge(gpu, "one photo a step", &set, &steps);
+            judge(gpu, "two photos a step", &set, &[(&[0, 1], 0.0), (&[1, 0], 0.0)]);
+            judge(gpu, "dropping", &set, &[(&[0], 0.0), (&[1], 0.1), (&[0], 0.0), (&[1], 0.0)]);
         }
-    }
-}
-
-/// A step that leaves out four of ten Gaussians.
-fn leaving_out(seed: u32) -> TrainingStep {
-    TrainingStep { dropout: Dropout::new(0.4, seed), ..step(0.0) }
-}
-
-#[test]
-fn what_a_step_leaves_out_stays_as_it_is() {
-    let truth = cloud(1_500, 1, 5);
-    let (start, photos) = (disturbed(&truth), photos(&truth, &[[75, 50], [64, 48]]));
-    let (set, renderer) = (set(&start, &photos), cpu());
-    let with_leaving_out = leaving_out(7);
-    let judge = |name: &str, mut trainer: Box<dyn Trainer + '_>| {
-        trainer.step(&[0, 1], &with_leaving_out).expect("a step");
-        let raw = trainer.gaussians().expect("moved").into_raw();
-        let moved = |i: &usize| {
-            raw.means[*i] != start.means()[*i]
-                || raw.opacities[*i] != start.opacities()[*i]
-                || raw.sh[4 * i..4 * i + 4] != start.sh()[4 * i..4 * i + 4]
-        };
-        let (out, rest): (Vec<_>, Vec<_>) =
-            (0..start.len()).partition(|&i| with_leaving_out.dropout.leaves_out(i as u32));
-        assert_eq!(out.iter().filter(|i| moved(i)).count(), 0, "{name}: left out, and moved");
-        let count = rest.iter().filter(|i| moved(i)).count();
-        assert!(count * 2 > rest.len(), "{name}: {count} of {} moved", rest.len());
-    };
-    judge("processor", Box::new(HostTrainer::new(&renderer, &set).expect("a trainer")));
-    for gpu in both_kernels() {
-        judge("device", gpu.trainer(&set, u64::MAX).expect("room").expect("a trainer"));
     }
 }
 
@@ -308,19 +264,11 @@ fn a_step_that_lacks_room_is_taken_once() {
         assert!(pairs[0] > 1 << 16 && pairs[1] < 1 << 16, "{pairs:?} pairs");
         let start = disturbed(&truth);
         let set = set(&start, &photos);
-        judge(gpu, "one alone", &set, &[(&[0], step(0.0))]);
-        judge(gpu, "left out, and room lacks", &set, &[(&[0], leaving_out(1))]);
-        judge(
-            gpu,
-            "both lack room",
-            &set,
-            &[(&[0], step(0.0)), (&[0], step(0.0)), (&[1], step(0.0))],
-        );
+        judge(gpu, "one alone", &set, &[(&[0], 0.0)]);
+        judge(gpu, "both lack room", &set, &[(&[0], 0.0), (&[0], 0.0), (&[1], 0.0)]);
         // The next one was under way when it was known that the first lacked room.
-        let taken: [Steps<'_>; 2] = [
-            &[(&[0], step(0.0)), (&[1], step(0.0)), (&[1], step(0.0))],
-            &[(&[1], step(0.0)), (&[0], step(0.0)), (&[1], step(0.0))],
-        ];
+        let taken: [Steps<'_>; 2] =
+            [&[(&[0], 0.0), (&[1], 0.0), (&[1], 0.0)], &[(&[1], 0.0), (&[0], 0.0), (&[1], 0.0)]];
         judge_order(gpu, "the first lacks room", &set, taken);
     }
 }

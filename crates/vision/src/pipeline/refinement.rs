@@ -216,7 +216,7 @@ impl Parts<'_, '_> {
         let (start, gaussians) = self.begin(&[])?;
         let steps = self.options.budget.steps.min(UNWATCHED_STEPS_MAX);
         let budget = RefineBudget { steps, ..self.options.budget };
-        let options = RefineOptions { budget, dropout: 0.0, ..self.options };
+        let options = RefineOptions { budget, ..self.options };
         let made = self.work(&start, &gaussians, &[], &options)?;
         let report = self.report_of(&start, &made, made.steps, [None; 2]);
         let (gaussians, poses) = (made.gaussians, self.poses());
@@ -649,12 +649,11 @@ impl Parts<'_, '_> {
         RefineBudget { steps, time: time.saturating_sub(done.time) }
     }
 
-    /// The options of a part: photos are learnt at half their size in the first alone, and
-    /// Gaussians are left out of steps in all others.
+    /// The options of a part: photos are learnt at half their size in the first alone.
     fn options_of(&self, budget: RefineBudget, is_first: bool) -> RefineOptions {
         let options = RefineOptions { budget, ..self.options };
         match is_first {
-            true => RefineOptions { dropout: 0.0, ..options },
+            true => options,
             false => RefineOptions { coarse_share: 0.0, ..options },
         }
     }

@@ -29,7 +29,7 @@ use std::{
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 use segsplat_render::{
-    Background, DifferentiableRenderer, Dropout, Frame, Kinds, Layer, RenderRequest, Renderer,
+    Background, DifferentiableRenderer, Frame, Kinds, Layer, RenderRequest, Renderer,
     compare::psnr,
     plan::{default_near, served, widened},
     train::{
@@ -83,9 +83,6 @@ const LAST_RATE: f32 = 0.1;
 const STEPS_A_PHOTO: f32 = 200.0;
 const RATE_FACTOR_POWER: f32 = 0.4;
 const RATE_FACTOR_MAX: f32 = 2.0;
-/// Share of the budget at whose end no Gaussian is left out any more: all learn what they are
-/// together.
-const WHOLE_SHARE: f32 = 0.05;
 /// What an SSIM of 1 is worth, dB of PSNR.
 const SSIM_DB: f64 = 20.0;
 /// How fast an exposure moves.
@@ -150,10 +147,6 @@ pub struct RefineOptions {
     pub prune_every: u32,
     /// Share of SSIM in the loss, 0..1.
     pub ssim_share: f32,
-    /// Chance of each Gaussian to be left out of a step, but not of the last ones
-    /// ([`segsplat_render::Dropout`]); of [`crate::pipeline::refinement::refined`] from the second
-    /// part on. 0 unless asked for: docs/adr/0110 says which scenes it helps and which it costs.
-    pub dropout: f32,
     /// How far cameras turn in a step at first, radians, and move, as a share of the scene's median
     /// depth; 0: they stay where they are.
     pub pose_rate: f32,
@@ -197,7 +190,6 @@ impl Default for RefineOptions {
             opacity_min: 0.01,
             prune_every: 50,
             ssim_share: 0.2,
-            dropout: 0.0,
             pose_rate: 1e-3,
             mends_from: 0.25,
             first_steps: 400,
@@ -865,18 +857,7 @@ impl Course<'_> {
             exposure: EXPOSURE_RATE * rate,
             poses: self.poses.scaled(rate),
             opacity_min: if prunes { self.options.opacity_min } else { 0.0 },
-            dropout: self.dropout(steps, spent),
         }
-    }
-
-    /// The Gaussians that the step after so many leaves out.
-    fn dropout(&self, steps: u32, spent: f32) -> Dropout {
-        if spent >= 1.0 - WHOLE_SHARE {
-            return Dropout::NONE;
-        }
-        #[expect(clippy::cast_possible_truncation, reason = "its lower bits differ too")]
-        let seed = (self.options.seed as u32).wrapping_add(steps);
-        Dropout::new(self.options.dropout, seed)
     }
 }
 

@@ -18,7 +18,7 @@ use segsplat_core::{
     },
 };
 use segsplat_render::{
-    Background, DifferentiableRenderer, Dropout, Frame, Kinds, RenderRequest, Renderer,
+    Background, DifferentiableRenderer, Frame, Kinds, RenderRequest, Renderer,
     backward::{FrameGradients, Gradients},
     cpu::CpuRenderer,
     train::{Trainer, TrainingSet, pose::moved},
@@ -128,18 +128,18 @@ fn cpu() -> CpuRenderer {
 }
 
 /// A renderer on the processor that may say that it is a device, or have no room for a trainer. It
-/// counts its views, and keeps those that it goes back from.
+/// counts its views, and keeps the width and the focal length of those that it goes back from.
 struct Watched {
     cpu: CpuRenderer,
     is_device: bool,
     is_full: bool,
     drawn: AtomicUsize,
-    steps: Mutex<Vec<RenderRequest>>,
+    lenses: Mutex<Vec<(u32, f64)>>,
 }
 
 fn watched() -> Watched {
-    let (drawn, steps) = (AtomicUsize::new(0), Mutex::default());
-    Watched { cpu: cpu(), is_device: false, is_full: false, drawn, steps }
+    let (drawn, lenses) = (AtomicUsize::new(0), Mutex::default());
+    Watched { cpu: cpu(), is_device: false, is_full: false, drawn, lenses }
 }
 
 impl Renderer for Watched {
@@ -165,7 +165,8 @@ impl DifferentiableRenderer for Watched {
         loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
         gradients: &mut Gradients,
     ) -> Result<Frame> {
-        self.steps.lock().expect("a lock").push(request.clone());
+        let lens = request.lens();
+        self.lenses.lock().expect("a lock").push((lens.width, lens.fx));
         self.cpu.backward(gaussians, request, loss, gradients)
     }
 
@@ -219,7 +220,6 @@ fn photos_on_disk_are_learnt_beside_the_others() {
         coarse_share: 0.4,
         coarse_side_min: 20,
         growth: 0.0,
-        dropout: 0.0,
         ..RefineOptions::default()
     };
     let gaussians = ready(&scene, &start, &options).expect("Gaussians");
@@ -413,8 +413,7 @@ fn large_photos_are_learnt_at_half_their_size_first() {
         let budget = RefineBudget::steps(20);
         let options = RefineOptions { budget, coarse_share, growth: 0.0, ..Default::default() };
         refined_by(&renderer, &truth, photos, &options);
-        let steps = renderer.steps.into_inner().expect("a lock").into_iter();
-        steps.map(|step| (step.lens().width, step.lens().fx)).collect::<Vec<_>>()
+        renderer.lenses.into_inner().expect("a lock")
     };
     let found = widths(0.3, &photos);
     let focal = photos[0].camera.intrinsics.fx;
@@ -423,35 +422,6 @@ fn large_photos_are_learnt_at_half_their_size_first() {
     let (_, small) = captured(5);
     let focal = small[0].camera.intrinsics.fx;
     assert_eq!(widths(0.3, &small), [(48, focal); 20], "small photos have no smaller copies");
-}
-
-#[test]
-fn steps_leave_gaussians_out_from_the_second_part_on_but_not_the_last_of_a_part() {
-    let (_, photos) = captured(9);
-    let renderer = watched();
-    let options = RefineOptions {
-        dropout: 0.25,
-        gain_min: f64::MIN,
-        overfit_further: f32::MAX,
-        pose_rate: 0.0,
-        ..steps_of(160, 40)
-    };
-    assert_eq!(refined_whole(&renderer, &photos, &options, &|| ()).found.versions, 2);
-    let steps = renderer.steps.into_inner().expect("a lock");
-    let dropouts: Vec<Dropout> = steps.iter().map(|step| step.dropout).collect();
-    // A fourth of each part is its proof.
-    let part = |steps: u32, whole: usize| {
-        let plain = vec![Dropout::NONE; whole];
-        [(0..steps).map(|step| Dropout::new(0.25, 1 + step)).collect(), plain].concat()
-    };
-    assert_eq!(dropouts, [part(0, 40), part(29, 1), part(86, 4)].concat());
-    let few = watched();
-    refined_whole(&few, &photos[..3], &options, &|| ());
-    let steps = few.steps.into_inner().expect("a lock");
-    assert!(
-        steps.len() > 1 && steps.iter().all(|step| step.dropout == Dropout::NONE),
-        "few photos"
-    );
 }
 
 #[test]
