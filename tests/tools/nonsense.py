@@ -1,4 +1,4 @@
-"""Nonsense asked of scenes, over HTTP: how much of it is found, with words that are there beside it.
+"""Nonsense asked of scenes, over HTTP: how much is found, with words that are there beside it.
 
     PYTHONPATH=clients/python/src SEGSPLAT_BIN=target/release/segsplat \\
         python tests/tools/nonsense.py ../shared/data/scenes/*
@@ -21,8 +21,8 @@ import segsplat
 
 PHOTOS, STRINGS, ASKED_AT_ONCE = 4, 200, 100
 WORDS = (
-    "chair table book box cup bottle lamp door window shelf monitor keyboard toy plant sofa bag can "
-    "pot knife fox duck car mouse floor"
+    "chair table book box cup bottle lamp door window shelf monitor keyboard toy plant sofa bag "
+    "can pot knife fox duck car mouse floor"
 ).split()
 
 
