@@ -550,8 +550,8 @@ network! {
         /// Token of a word that is not known.
         #[serde(default = "defaults::unknown")]
         pub unknown: String,
-        /// A word that the tokenizer cuts into pieces of fewer letters than this, on average, counts
-        /// as not known, unless `words` has it; 0: none does.
+        /// A word that the tokenizer cuts into pieces of fewer letters than this, on average,
+        /// counts as not known, unless `words` has it; 0: none does.
         #[serde(default)]
         pub piece_letters: f32,
         /// Input: `[B, T]` i64.
