@@ -339,7 +339,7 @@ fn jpeg(photo: &Photo, focal: Option<f64>) -> Result<Vec<u8>> {
     Ok(jpeg)
 }
 
-/// FocalLengthIn35mmFilm is whole millimetres, as phones write it.
+/// `FocalLengthIn35mmFilm` is whole millimetres, as phones write it.
 fn exif(photo: &Photo, focal: f64) -> Vec<u8> {
     let diagonal = f64::from(photo.width).hypot(f64::from(photo.height));
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "tens")]
