@@ -76,21 +76,23 @@ fuzz: setup
 # Debian's python3 has no venv; pip brings virtualenv.
 CLIENT := $(abspath $(TARGET))/client
 PROGRAM = $(abspath $(or $(SEGSPLAT_BIN),$(TARGET)/debug/segsplat))
-venv: $(if $(SEGSPLAT_BIN),,setup)
+PACKAGES := clients/python/tests/requirements.txt tests/page/requirements.txt
+venv: $(CLIENT)/ready $(if $(SEGSPLAT_BIN),,setup)
 	$(if $(SEGSPLAT_BIN),,$(CARGO) build --locked)
+
+$(CLIENT)/ready: $(PACKAGES) clients/python/pyproject.toml clients/python/src/segsplat/_version.py
 	python3 -m pip install --quiet --disable-pip-version-check --upgrade --target $(CLIENT)/tools \
 		$$(grep '^virtualenv' clients/python/tests/requirements.txt)
 	PYTHONPATH=$(CLIENT)/tools python3 -m virtualenv --quiet $(CLIENT)/venv
+	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check -e clients/python \
+		$(PACKAGES:%=-r %)
+	touch $@
 
 client: venv
-	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check -e clients/python \
-		-r clients/python/tests/requirements.txt
 	cd clients/python && SEGSPLAT_BIN=$(PROGRAM) $(CLIENT)/venv/bin/python -m pytest
 
 # The browser is one that `scripts/setup --ci` finds or gets, or SEGSPLAT_BROWSER.
 page page-long: venv
-	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check \
-		-r tests/page/requirements.txt
 	SEGSPLAT_BIN=$(PROGRAM) $(if $(filter page-long,$@),PAGE_GAUSSIANS=4000000) \
 		$(CLIENT)/venv/bin/python -m pytest $(if $(filter page-long,$@),-s tests/page/test_large.py,tests/page)
 
@@ -111,8 +113,6 @@ judge-tools: venv
 judge: judge-containers judge-folders judge-inference judge-published judge-splats judge-three judge-compose
 
 judge-splats: judge-tools
-	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check \
-		-r tests/page/requirements.txt
 	$(CLIENT)/venv/bin/python tests/tools/judge_splats.py $(PROGRAM) $(CLIENT)/venv/bin/node \
 		$(JUDGE)/node_modules/@playcanvas/splat-transform/bin/cli.mjs \
 		tests/fixtures/splats/source.ply
@@ -129,8 +129,6 @@ proto: venv
 
 # three.js in the browser of `make page`; what it and we draw goes to target/judge/three.
 judge-three: judge-tools
-	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check \
-		-r tests/page/requirements.txt
 	mkdir -p $(JUDGE)/three
 	$(CLIENT)/venv/bin/python tests/tools/judge_three.py $(PROGRAM) \
 		$(JUDGE)/node_modules/three $(JUDGE)/three

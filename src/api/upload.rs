@@ -67,8 +67,9 @@ pub(super) struct UploadBuilder<'a> {
     keeper: Option<(Service, Option<SceneId>)>,
     /// What goes to the store.
     receiving: Option<Receiving>,
-    /// Whether the file that is being read stays in memory, and its bytes so far.
+    /// Whether the file that is being read stays in memory, its name, and its bytes so far.
     is_here: bool,
+    file: String,
     file_bytes: usize,
 }
 
@@ -87,6 +88,7 @@ impl<'a> UploadBuilder<'a> {
             keeper: None,
             receiving: None,
             is_here: true,
+            file: String::new(),
             file_bytes: 0,
         }
     }
@@ -166,7 +168,7 @@ impl<'a> UploadBuilder<'a> {
 
     /// Begins a file in the store, where files go there by now; else it is to be in memory.
     async fn begin_file(&mut self, current: Current, part: FilePart, name: &str) -> Result<bool> {
-        (self.current, self.file_bytes) = (current, 0);
+        (self.current, self.file, self.file_bytes) = (current, name.to_owned(), 0);
         self.is_here = self.receiving.is_none();
         if let Some(receiving) = &mut self.receiving {
             receiving.begin_file(part, name.to_owned()).await?;
@@ -278,12 +280,8 @@ impl<'a> UploadBuilder<'a> {
         self.file_bytes = self.file_bytes.saturating_add(bytes);
         let (bytes, max) = (self.file_bytes, self.limits.upload_file_bytes_max);
         if self.current != Current::Archive && bytes > max {
-            let what = "upload: one file";
-            return Err(Error::limit(
-                what,
-                format!("{bytes} bytes so far"),
-                format!("{max} bytes"),
-            ));
+            let file = format!("file {:?} of {bytes} bytes so far", short(&self.file));
+            return Err(Error::limit("upload", file, format!("{max} bytes")));
         }
         Ok(())
     }

@@ -51,7 +51,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         }
         Some((format, FormatKind::Streamed)) => {
             has_no_photos(args, format.name)?;
-            return levels(args, config, out);
+            return levels(args, format.name, config, out);
         }
         Some((_, FormatKind::Splats(splats))) => splats,
         _ => {
@@ -129,12 +129,12 @@ fn folder(
     out.answer(&text, &value)
 }
 
-fn levels(args: &Args, config: &Config, out: &Output) -> Result<()> {
+fn levels(args: &Args, format: &str, config: &Config, out: &Output) -> Result<()> {
     let scene = scene_file::open(&args.scene, &config.limits)?.scene;
     let (levels, size_bytes) = whole(&args.output, |to| scene_levels(&scene, to))?;
     let (path, count) = (args.output.display(), scene.gaussians.len());
     let value = json!({
-        "output": path.to_string(), "format": "sog_lod", "gaussians": count, "levels": levels,
+        "output": path.to_string(), "format": format, "gaussians": count, "levels": levels,
         "size_bytes": size_bytes,
     });
     let text = format!("{path}: {count} Gaussians in {levels} levels, {size_bytes} bytes");

@@ -36,7 +36,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         (None, _) => None,
         (Some(_), [a, b, ..]) => Some([*a, *b]),
         (Some(_), few) => {
-            let why = format!("metres is between two points; {} are given", few.len());
+            let why = format!("--metres is between two --points; {} given", few.len());
             return Err(Error::invalid(why));
         }
     };
@@ -47,7 +47,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let (scale, measured) = service.measure(&opened.scene, spec, points)?;
     let mut says = match scale.metres_per_unit {
         Some(metres) => format!("a unit is {metres:.4} m"),
-        None => "what a unit is is not known".to_owned(),
+        None => "metres are not known".to_owned(),
     };
     says.push_str(match scale.ground {
         Some(_) => "; the ground was found",

@@ -4,22 +4,36 @@ from __future__ import annotations
 
 import json
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from acts import pixels, post, sample, settled, until
 from playwright.sync_api import Page, Route, expect
-from served import run
+from served import ROOT, run, served
 
 
-def test_a_better_version_is_shown_and_the_view_stays(page: Page, url: str, tmp_path: Path) -> None:
+@pytest.fixture
+def soon(tmp_path: Path) -> Iterator[str]:
+    """The address of a server of its own, of small scenes: their versions come soon, and nothing
+    is refined beside the tests that follow."""
+    config = tmp_path / "segsplat.toml"
+    config.write_text("[limits]\nrefine_steps_max = 100\n")
+    with served(tmp_path / "data", "--renderer", "cpu", "--config", config,
+                "--bundle", ROOT / "tests/fixtures/plane") as address:
+        yield address
+
+
+def test_a_better_version_is_shown_and_the_view_stays(
+        page: Page, soon: str, tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     run("sample", "--photos", "6", "--size", "96x72", "-o", photos)
-    scene = post(url, [("transforms", name, data) if name == "transforms.json"
+    scene = post(soon, [("transforms", name, data) if name == "transforms.json"
                        else ("photo", f"images/{name}", data)
                        for name, data in sample(photos).items()])
-    with urllib.request.urlopen(f"{url}/v1/scenes/{scene}/refine?refine=600000", b"") as answer:
+    with urllib.request.urlopen(f"{soon}/v1/scenes/{scene}/refine?refine=600000", b"") as answer:
         assert json.load(answer)["refinement"]["state"] == "running"
-    page.goto(f"{url}/#scene={scene}")
+    page.goto(f"{soon}/#scene={scene}")
     settled(page)
     asked = "() => [segsplat.state.scene.gaussians, segsplat.state.camera]"
     count, camera = page.evaluate(asked)
@@ -27,7 +41,7 @@ def test_a_better_version_is_shown_and_the_view_stays(page: Page, url: str, tmp_
     settled(page)
     better, same = page.evaluate(asked)
     assert camera == same
-    with urllib.request.urlopen(f"{url}/v1/scenes/{scene}") as answer:
+    with urllib.request.urlopen(f"{soon}/v1/scenes/{scene}") as answer:
         assert json.load(answer)["version"] > 1
     assert page.evaluate("segsplat.drawing.count") == better
 

@@ -33,14 +33,14 @@ fn server(data: &Path) -> Process {
 type Room = (Vec<UploadFile>, Vec<Camera>);
 
 fn generated(photos: usize, seed: u64) -> Room {
-    let options = SampleOptions { photos, width: 480, height: 360, seed };
+    let options = SampleOptions { photos, width: 360, height: 270, seed };
     let files = sample::upload(&options).unwrap().photos;
     (files, sample::cameras(&options).unwrap())
 }
 
-/// Eight photos of a generated room, and their cameras: drawn once, which takes seconds.
+/// Five photos of a generated room, and their cameras: drawn once, which takes seconds.
 fn room() -> Room {
-    static ROOM: LazyLock<Room> = LazyLock::new(|| generated(8, 1));
+    static ROOM: LazyLock<Room> = LazyLock::new(|| generated(5, 1));
     ROOM.clone()
 }
 

@@ -11,7 +11,7 @@ use crate::common::{
 };
 
 /// Photos that join one by one: in the short form, and in the long one.
-const PHOTOS: [usize; 2] = [24, 1_000];
+const PHOTOS: [usize; 2] = [8, 1_000];
 /// Photos that the scene keeps.
 const KEPT: usize = 12;
 /// Photos that are sent again and again; each time the scene has forgotten them.

@@ -11,7 +11,7 @@ use segsplat::{
 use crate::common::process::{self, Start, can_serve, long};
 
 /// Photos of the short form and of the long one, and bytes of each.
-const PHOTOS: [usize; 2] = [60, 300];
+const PHOTOS: [usize; 2] = [40, 300];
 const PHOTO_BYTES: usize = 4 << 20;
 /// What may come to the memory of the idle process: what stays of an upload, a few parts on their
 /// way to the store, two photos at once, and what the jobs of small photos take.

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use glam::{DMat3, DVec3};
-use image::{ExtendedColorType, codecs::jpeg::JpegEncoder};
+use image::{ExtendedColorType, ImageEncoder as _, ImageError, codecs::jpeg::JpegEncoder};
 use rayon::prelude::*;
 use segsplat_testing::scenes::Random;
 use serde_json::json;
@@ -13,6 +13,7 @@ use crate::{
     error::{Error, Result},
     sample::{Room, TARGET},
     scene::{Camera, CameraToWorld, Intrinsics, Photo, Upload, UploadFile},
+    warp::bilinear,
 };
 
 /// Captures that the bars of the issue are about.
@@ -311,28 +312,16 @@ fn taken(photo: Photo, spoilt: Spoilt, random: &mut Random) -> Photo {
 /// RGB along a way about each pixel, which stays in its middle.
 fn blurred(values: &[f64], width: usize, [x, y]: [f64; 2]) -> Vec<f64> {
     const STEPS: u32 = 9;
-    let height = values.len() / (3 * width);
-    let at = |px: f64, py: f64, c: usize| {
-        let (px, py) = (px.clamp(0.0, (width - 1) as f64), py.clamp(0.0, (height - 1) as f64));
-        let (x0, y0) = (px.floor(), py.floor());
-        let (ax, ay) = (px - x0, py - y0);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
-        let (x0, y0) = (x0 as usize, y0 as usize);
-        let (x1, y1) = ((x0 + 1).min(width - 1), (y0 + 1).min(height - 1));
-        let of = |x: usize, y: usize| values[3 * (y * width + x) + c];
-        let above = of(x0, y0) * (1.0 - ax) + of(x1, y0) * ax;
-        let under = of(x0, y1) * (1.0 - ax) + of(x1, y1) * ax;
-        above * (1.0 - ay) + under * ay
-    };
     let mut blurred = Vec::with_capacity(values.len());
-    for i in 0..width * height {
-        for c in 0..3 {
-            let one = |step: u32| {
-                let share = f64::from(step) / f64::from(STEPS - 1) - 0.5;
-                at((i % width) as f64 + share * x, (i / width) as f64 + share * y, c)
-            };
-            blurred.push((0..STEPS).map(one).sum::<f64>() / f64::from(STEPS));
+    for i in 0..values.len() / 3 {
+        let mut sum = [0.0; 3];
+        for step in 0..STEPS {
+            let share = f64::from(step) / f64::from(STEPS - 1) - 0.5;
+            let (px, py) = ((i % width) as f64 + share * x, (i / width) as f64 + share * y);
+            let found = bilinear(values, width, px, py);
+            sum.iter_mut().zip(found).for_each(|(sum, found)| *sum += found);
         }
+        blurred.extend(sum.map(|sum| sum / f64::from(STEPS)));
     }
     blurred
 }
@@ -340,22 +329,26 @@ fn blurred(values: &[f64], width: usize, [x, y]: [f64; 2]) -> Vec<f64> {
 /// A JPEG file, with a focal length in its EXIF where one is told.
 fn jpeg(photo: &Photo, focal: Option<f64>) -> Result<Vec<u8>> {
     let mut jpeg = Vec::new();
-    JpegEncoder::new_with_quality(&mut jpeg, QUALITY)
-        .encode(&photo.rgb, photo.width, photo.height, ExtendedColorType::Rgb8)
+    let mut encoder = JpegEncoder::new_with_quality(&mut jpeg, QUALITY);
+    let told = focal.map_or(Ok(()), |focal| encoder.set_exif_metadata(exif(photo, focal)));
+    told.map_err(ImageError::Unsupported)
+        .and_then(|()| {
+            encoder.encode(&photo.rgb, photo.width, photo.height, ExtendedColorType::Rgb8)
+        })
         .map_err(|e| Error::internal("a rendered photo is no JPEG").caused_by(e))?;
-    let Some(focal) = focal else { return Ok(jpeg) };
-    // FocalLengthIn35mmFilm is whole millimetres, as phones write it.
+    Ok(jpeg)
+}
+
+/// `FocalLengthIn35mmFilm` is whole millimetres, as phones write it.
+fn exif(photo: &Photo, focal: f64) -> Vec<u8> {
     let diagonal = f64::from(photo.width).hypot(f64::from(photo.height));
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "tens")]
     let [low, high] = ((focal / diagonal * FILM_DIAGONAL).round() as u16).to_le_bytes();
-    let tiff = [
+    [
         // The first directory at 8: one entry, the EXIF directory at 26.
         &b"II*\0\x08\0\0\0\x01\0\x69\x87\x04\0\x01\0\0\0\x1A\0\0\0\0\0\0\0"[..],
         &b"\x01\0\x05\xA4\x03\0\x01\0\0\0"[..],
         &[low, high, 0, 0, 0, 0, 0, 0],
     ]
-    .concat();
-    #[expect(clippy::cast_possible_truncation, reason = "tens of bytes")]
-    let length = (tiff.len() as u16 + 8).to_be_bytes();
-    Ok([&jpeg[..2], b"\xFF\xE1", &length, b"Exif\0\0", &tiff, &jpeg[2..]].concat())
+    .concat()
 }

@@ -1,23 +1,9 @@
-//! Fusion: a surface that many photos show is kept from a few of them.
-//!
-//! First what hides the surfaces of many other photos is dropped ([`FreeSpace`]). Then photos are
-//! taken one after another, the surest first. A Gaussian is dropped where at least
-//! [`FuseOptions::layers`] photos before it *kept* a Gaussian of the same surface at that place,
-//! no coarser than its own. So no hole opens, and a surface that sixty photos show has as many
-//! layers as a surface that a few photos show.
+//! Fusion: a surface that many photos show is kept from a few of them ([`Layers`]).
 
 use std::sync::atomic::AtomicBool;
 
-use rayon::prelude::*;
-
-use super::{
-    free_space::{FreeSpace, carve, neighbors},
-    surface::{Fate, Look, Surface, surest_first},
-};
-use crate::{
-    error::Result,
-    scene::{ViewGaussians, unless_cancelled},
-};
+use super::{free_space::FreeSpace, layers::Layers, surface::Fate};
+use crate::{error::Result, scene::ViewGaussians};
 
 /// What counts as one surface, and how many layers it may have.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -60,46 +46,14 @@ pub(super) fn fuse(
     options: &FuseOptions,
     cancel: &AtomicBool,
 ) -> Result<Vec<Vec<Fate>>> {
-    let mut fates = Fate::of_candidates(candidate);
     if views.len() <= options.layers {
-        return Ok(fates);
+        return Ok(Fate::of_candidates(candidate));
     }
-    let surfaces: Vec<Surface<'_>> =
-        views.iter().zip(candidate).map(|(view, keep)| Surface::new(view, keep)).collect();
-    let near = neighbors(&surfaces, options.free_space.neighbors);
-    carve(&surfaces, &near, &mut fates, &options.free_space, cancel)?;
-    let mut before: Vec<usize> = Vec::with_capacity(views.len());
-    for v in surest_first(views) {
-        unless_cancelled(cancel)?;
-        let mut own = std::mem::take(&mut fates[v]);
-        own.par_iter_mut().enumerate().for_each(|(i, fate)| {
-            if *fate == Fate::Keep && is_covered(&surfaces, &fates, &before, options, v, i) {
-                *fate = Fate::Duplicate;
-            }
-        });
-        fates[v] = own;
-        before.push(v);
-    }
-    Ok(fates)
-}
-
-/// Whether enough of the views `before` kept a Gaussian of the surface of Gaussian `i` of view `v`.
-fn is_covered(
-    surfaces: &[Surface<'_>],
-    fates: &[Vec<Fate>],
-    before: &[usize],
-    options: &FuseOptions,
-    v: usize,
-    i: usize,
-) -> bool {
-    let (world, own_footprint) = (surfaces[v].world(i), surfaces[v].footprint(i));
-    let covers = |&&w: &&usize| {
-        let other = &surfaces[w];
-        other.look(world).is_some_and(|Look { at, z, surface }| {
-            fates[w][at] == Fate::Keep
-                && other.footprint(at) <= own_footprint * options.footprint_ratio_max
-                && ((z - surface) / surface).abs() <= options.same_surface
-        })
+    let layers = Layers {
+        most: options.layers,
+        same_surface: options.same_surface,
+        footprint_ratio_max: options.footprint_ratio_max,
+        near_only: false,
     };
-    before.iter().filter(covers).take(options.layers).count() >= options.layers
+    layers.keep(views, candidate, &options.free_space, cancel)
 }

@@ -7,6 +7,7 @@
 mod backdrop;
 mod free_space;
 mod fuse;
+mod layers;
 mod surface;
 mod thin;
 mod union;

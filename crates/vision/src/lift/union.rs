@@ -2,9 +2,8 @@
 //!
 //! 1. **Free space.** What stands in front of the surface that other photos see is dropped
 //!    ([`FreeSpace`]).
-//! 2. **Layers.** Photos are taken one after another, the surest first. A Gaussian is dropped where
-//!    [`UnionOptions::layers`] neighbours before it *kept* a Gaussian of the same surface, not much
-//!    coarser than its own. So no hole opens.
+//! 2. **Layers.** Of a surface that many photos show the Gaussians of a few of them are kept
+//!    ([`Layers`]).
 //! 3. **Shape.** Wide Gaussians reach over the borders of things, so scales get a bound. The
 //!    opacity of the kept ones makes up for the dropped layers.
 //!
@@ -15,15 +14,8 @@ use std::sync::atomic::AtomicBool;
 
 use rayon::prelude::*;
 
-use super::{
-    free_space::{FreeSpace, carve, neighbors},
-    surface::{Fate, Look, PIXELS_A_TASK, Surface, surest_first},
-};
-use crate::{
-    error::Result,
-    point,
-    scene::{ViewGaussians, unless_cancelled},
-};
+use super::{free_space::FreeSpace, layers::Layers, surface::Fate};
+use crate::{error::Result, point, scene::ViewGaussians};
 
 /// What hides what, and how many layers a surface may have. Chosen on four real scenes of 9 to 20
 /// photos that are not reported: docs/adr/0034-many-photos.md.
@@ -70,53 +62,18 @@ pub(super) fn unite(
     options: &UnionOptions,
     cancel: &AtomicBool,
 ) -> Result<Vec<Vec<Fate>>> {
-    let mut fates = Fate::of_candidates(candidate);
     if views.len() <= options.few {
-        return Ok(fates);
+        return Ok(Fate::of_candidates(candidate));
     }
-    let surfaces: Vec<Surface<'_>> =
-        views.iter().zip(candidate).map(|(view, keep)| Surface::new(view, keep)).collect();
-    let near = neighbors(&surfaces, options.free_space.neighbors);
-    carve(&surfaces, &near, &mut fates, &options.free_space, cancel)?;
-    // Views that were decided; the others cover nothing yet.
-    let mut decided = vec![false; views.len()];
-    for v in surest_first(views) {
-        unless_cancelled(cancel)?;
-        let before: Vec<usize> = near[v].iter().copied().filter(|&w| decided[w]).collect();
-        let mut own = std::mem::take(&mut fates[v]);
-        own.par_iter_mut().enumerate().with_min_len(PIXELS_A_TASK).for_each(|(i, fate)| {
-            if *fate == Fate::Keep && is_covered(&surfaces, &fates, &before, v, i, options) {
-                *fate = Fate::Duplicate;
-            }
-        });
-        fates[v] = own;
-        decided[v] = true;
-    }
-    drop(surfaces);
+    let layers = Layers {
+        most: options.layers,
+        same_surface: options.free_space.same_surface,
+        footprint_ratio_max: options.footprint_ratio_max,
+        near_only: true,
+    };
+    let fates = layers.keep(views, candidate, &options.free_space, cancel)?;
     views.par_iter_mut().for_each(|view| shape(view, options));
     Ok(fates)
-}
-
-/// Whether enough of the views `before` kept a Gaussian of the surface of Gaussian `i` of view `v`.
-fn is_covered(
-    surfaces: &[Surface<'_>],
-    fates: &[Vec<Fate>],
-    before: &[usize],
-    v: usize,
-    i: usize,
-    options: &UnionOptions,
-) -> bool {
-    let own = &surfaces[v];
-    let (world, finest) = (own.world(i), own.footprint(i));
-    let covers = |&&w: &&usize| {
-        let other = &surfaces[w];
-        other.look(world).is_some_and(|Look { at, z, surface }| {
-            fates[w][at] == Fate::Keep
-                && other.footprint(at) <= finest * options.footprint_ratio_max
-                && ((z - surface) / surface).abs() < options.free_space.same_surface
-        })
-    };
-    before.iter().filter(covers).take(options.layers).count() >= options.layers
 }
 
 /// Bounds the scales and raises the opacities of a view.

@@ -18,7 +18,7 @@ use crate::{
     models::{
         NetworkOptions, SETUP_COMMAND,
         manifest::{
-            CamerasManifest, Faults, FeaturesManifest, GeometryManifest, ImageTextManifest,
+            CamerasManifest, Faults, FeaturesManifest, Files, GeometryManifest, ImageTextManifest,
             MANIFEST, MasksManifest, MatcherManifest, TextMasksManifest, is_plain, unavailable,
         },
         onnx::OnnxHeader,
@@ -61,9 +61,6 @@ struct BundleManifest {
     matcher: Option<MatcherManifest>,
     cameras: Option<CamerasManifest>,
 }
-
-/// The keys of weights beside a network, `data` and `data_sha256`.
-type Data<'a> = [&'a Option<String>; 2];
 
 /// A file that the manifest names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -303,52 +300,51 @@ impl Bundle {
         let BundleManifest { geometry, masks, image_text, text_masks, .. } = &self.manifest;
         let BundleManifest { features, matcher, cameras, .. } = &self.manifest;
         let mut files = Vec::new();
-        let mut network = |part, licence, [file, sha256]: [&'a str; 2], data: Data<'a>| {
+        let mut network = |part, licence: &'a str, ([file, sha256], data): Files<'a>| {
             files.push(BundleFile { part, file, sha256, licence });
             if let [Some(file), Some(sha256)] = data {
                 files.push(BundleFile { part, file, sha256, licence });
             }
         };
         let g = geometry;
-        network("geometry", &*g.licence, [&g.file, &g.sha256], [&g.data, &g.data_sha256]);
+        network("geometry", &g.licence, g.files());
         if let Some(cpu) = &g.cpu {
-            network("geometry.cpu", &g.licence, [&cpu.file, &cpu.sha256], [&None, &None]);
+            network("geometry.cpu", &g.licence, cpu.files());
         }
         if let Some(many) = &g.many {
-            network("geometry.many", &g.licence, [&many.file, &many.sha256], [&None, &None]);
+            network("geometry.many", &g.licence, ([&many.file, &many.sha256], [&None, &None]));
             if let Some(cpu) = &many.cpu {
-                let file = [&*cpu.file, &cpu.sha256];
-                network("geometry.many.cpu", &g.licence, file, [&None, &None]);
+                network("geometry.many.cpu", &g.licence, cpu.files());
             }
         }
         if let Some(MasksManifest { encoder: e, decoder: d, licence, .. }) = masks {
-            network("masks.encoder", licence, [&e.file, &e.sha256], [&e.data, &e.data_sha256]);
-            network("masks.decoder", licence, [&d.file, &d.sha256], [&d.data, &d.data_sha256]);
+            network("masks.encoder", licence, e.files());
+            network("masks.decoder", licence, d.files());
         }
         if let Some(image_text) = image_text {
             let ImageTextManifest { image: i, text: t, licence, .. } = image_text;
-            network("image_text.image", licence, [&i.file, &i.sha256], [&i.data, &i.data_sha256]);
-            network("image_text.text", licence, [&t.file, &t.sha256], [&t.data, &t.data_sha256]);
-            let tokenizer = [&*t.tokenizer, &t.tokenizer_sha256];
-            network("image_text.tokenizer", licence, tokenizer, [&None, &None]);
+            network("image_text.image", licence, i.files());
+            network("image_text.text", licence, t.files());
+            let tokenizer = [&t.tokenizer, &t.tokenizer_sha256];
+            network("image_text.tokenizer", licence, (tokenizer, [&None, &None]));
             if let Some(words) = &image_text.words {
-                network("image_text.words", licence, [&words.file, &words.sha256], [&None, &None]);
+                network("image_text.words", licence, words.files());
             }
         }
         if let Some(TextMasksManifest { image: i, find: f, licence, .. }) = text_masks {
-            network("text_masks.image", licence, [&i.file, &i.sha256], [&i.data, &i.data_sha256]);
-            network("text_masks.find", licence, [&f.file, &f.sha256], [&f.data, &f.data_sha256]);
-            let tokenizer = [&*f.tokenizer, &f.tokenizer_sha256];
-            network("text_masks.tokenizer", licence, tokenizer, [&None, &None]);
+            network("text_masks.image", licence, i.files());
+            network("text_masks.find", licence, f.files());
+            let tokenizer = [&f.tokenizer, &f.tokenizer_sha256];
+            network("text_masks.tokenizer", licence, (tokenizer, [&None, &None]));
         }
         if let Some(f) = features {
-            network("features", &f.licence, [&f.file, &f.sha256], [&f.data, &f.data_sha256]);
+            network("features", &f.licence, f.files());
         }
         if let Some(m) = matcher {
-            network("matcher", &m.licence, [&m.file, &m.sha256], [&m.data, &m.data_sha256]);
+            network("matcher", &m.licence, m.files());
         }
         if let Some(c) = cameras {
-            network("cameras", &c.licence, [&c.file, &c.sha256], [&c.data, &c.data_sha256]);
+            network("cameras", &c.licence, c.files());
         }
         files
     }

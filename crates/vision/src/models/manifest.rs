@@ -45,6 +45,34 @@ const KEYPOINTS_MAX: usize = 8_192;
 /// Tokens of one text.
 const CONTEXT_MAX: usize = 1_024;
 
+/// The files of a network: name and sha256 of its own, and of the weights beside it.
+pub(super) type Files<'a> = ([&'a String; 2], [&'a Option<String>; 2]);
+
+/// Declares the section of a network: the keys of its files, which all have, and those of its own.
+/// (`serde(flatten)` would not say which key has a value of another type.)
+macro_rules! network {
+    ($(#[$of:meta])* pub struct $name:ident { $($own:tt)* }) => {
+        $(#[$of])*
+        pub struct $name {
+            /// File in the bundle's folder.
+            pub file: String,
+            /// Its sha256, hex.
+            pub sha256: String,
+            /// File of the weights that are not in `file`.
+            pub data: Option<String>,
+            /// Its sha256, hex.
+            pub data_sha256: Option<String>,
+            $($own)*
+        }
+
+        impl $name {
+            pub(super) fn files(&self) -> Files<'_> {
+                ([&self.file, &self.sha256], [&self.data, &self.data_sha256])
+            }
+        }
+    };
+}
+
 /// The rigid frame that a geometry network's outputs are in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -105,54 +133,48 @@ pub struct GeometryOutputs {
     pub confidence: Option<String>,
 }
 
-/// The geometry network in `bundle.toml`.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct GeometryManifest {
-    /// File in the bundle's folder.
-    pub file: String,
-    /// Its sha256, hex.
-    pub sha256: String,
-    /// File of the weights that are not in `file`.
-    pub data: Option<String>,
-    /// Its sha256, hex.
-    pub data_sha256: Option<String>,
-    /// The same network as the CPU runs it, where that is another file: 8-bit arithmetic, and
-    /// operators of this program. It may take weights from the network's main file.
-    pub cpu: Option<PlainFile>,
-    /// The same network with other weights, for sets of more views.
-    pub many: Option<ManyViews>,
-    /// Licence of the weights.
-    pub licence: String,
-    /// Where the weights come from.
-    pub source: String,
-    /// Working sizes, `[height, width]`.
-    pub buckets: Vec<[u32; 2]>,
-    /// Fewest views at once.
-    pub views_min: usize,
-    /// Most views at once.
-    pub views_max: usize,
-    /// Most source views of a view.
-    pub neighbors_max: usize,
-    /// Degree of the spherical harmonics.
-    pub sh_degree: u8,
-    /// Frame of the outputs.
-    pub output_frame: OutputFrame,
-    /// Scale of the model frame.
-    pub translation: Translation,
-    /// `[near, far]` that every view gets, model units; absent: what is measured in each photo.
-    pub near_far: Option<[f64; 2]>,
-    /// Filter that brings a photo to the size of its bucket.
-    #[serde(default)]
-    pub resize: ResizeFilter,
-    /// Subtracted from the 0..1 channels.
-    pub mean: [f32; 3],
-    /// Divides them after that.
-    pub std: [f32; 3],
-    /// Input names.
-    pub inputs: GeometryInputs,
-    /// Output names.
-    pub outputs: GeometryOutputs,
+network! {
+    /// The geometry network in `bundle.toml`.
+    #[derive(Clone, Debug, PartialEq, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct GeometryManifest {
+        /// The same network as the CPU runs it, where that is another file: 8-bit arithmetic, and
+        /// operators of this program. It may take weights from the network's main file.
+        pub cpu: Option<PlainFile>,
+        /// The same network with other weights, for sets of more views.
+        pub many: Option<ManyViews>,
+        /// Licence of the weights.
+        pub licence: String,
+        /// Where the weights come from.
+        pub source: String,
+        /// Working sizes, `[height, width]`.
+        pub buckets: Vec<[u32; 2]>,
+        /// Fewest views at once.
+        pub views_min: usize,
+        /// Most views at once.
+        pub views_max: usize,
+        /// Most source views of a view.
+        pub neighbors_max: usize,
+        /// Degree of the spherical harmonics.
+        pub sh_degree: u8,
+        /// Frame of the outputs.
+        pub output_frame: OutputFrame,
+        /// Scale of the model frame.
+        pub translation: Translation,
+        /// `[near, far]` that every view gets, model units; absent: what is measured in each photo.
+        pub near_far: Option<[f64; 2]>,
+        /// Filter that brings a photo to the size of its bucket.
+        #[serde(default)]
+        pub resize: ResizeFilter,
+        /// Subtracted from the 0..1 channels.
+        pub mean: [f32; 3],
+        /// Divides them after that.
+        pub std: [f32; 3],
+        /// Input names.
+        pub inputs: GeometryInputs,
+        /// Output names.
+        pub outputs: GeometryOutputs,
+    }
 }
 
 /// A file that has no section of its own.
@@ -163,6 +185,12 @@ pub struct PlainFile {
     pub file: String,
     /// Its sha256, hex.
     pub sha256: String,
+}
+
+impl PlainFile {
+    pub(super) fn files(&self) -> Files<'_> {
+        ([&self.file, &self.sha256], [&None, &None])
+    }
 }
 
 /// Weights of a geometry network for sets of many views. Their file may take weights from the
@@ -215,15 +243,14 @@ impl GeometryManifest {
     }
 
     pub(super) fn validate(&self, faults: &mut Faults) {
-        faults.file("geometry", &self.file, &self.sha256);
-        faults.data("geometry", &self.data, &self.data_sha256);
+        faults.network("geometry", self.files());
         if let Some(cpu) = &self.cpu {
-            faults.file("geometry.cpu", &cpu.file, &cpu.sha256);
+            faults.network("geometry.cpu", cpu.files());
         }
         if let Some(many) = &self.many {
             faults.file("geometry.many", &many.file, &many.sha256);
             if let Some(cpu) = &many.cpu {
-                faults.file("geometry.many.cpu", &cpu.file, &cpu.sha256);
+                faults.network("geometry.many.cpu", cpu.files());
             }
             let larger = self.views_min.max(2) + 1..=self.views_max;
             faults.range("geometry.many.views_min", many.views_min, larger);
@@ -345,64 +372,52 @@ pub struct MasksManifest {
     pub decoder: MaskDecoderManifest,
 }
 
-/// The image encoder of a mask network.
-#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct MaskEncoderManifest {
-    /// File in the bundle's folder.
-    pub file: String,
-    /// Its sha256, hex.
-    pub sha256: String,
-    /// File of the weights that are not in `file`.
-    pub data: Option<String>,
-    /// Its sha256, hex.
-    pub data_sha256: Option<String>,
-    /// Input: `[1, 3, size, size]` f32.
-    pub input: String,
-    /// Output that becomes the decoder's `image_embeddings`.
-    pub output: String,
-    /// Further outputs that the decoder takes under the same names.
-    #[serde(default)]
-    pub features: Vec<String>,
+network! {
+    /// The image encoder of a mask network.
+    #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct MaskEncoderManifest {
+        /// Input: `[1, 3, size, size]` f32.
+        pub input: String,
+        /// Output that becomes the decoder's `image_embeddings`.
+        pub output: String,
+        /// Further outputs that the decoder takes under the same names.
+        #[serde(default)]
+        pub features: Vec<String>,
+    }
 }
 
-/// The prompt decoder of a mask network, with the names of its tensors; SAM's where not given.
-/// Inputs that the file does not have are not fed.
-#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct MaskDecoderManifest {
-    /// File in the bundle's folder.
-    pub file: String,
-    /// Its sha256, hex.
-    pub sha256: String,
-    /// File of the weights that are not in `file`.
-    pub data: Option<String>,
-    /// Its sha256, hex.
-    pub data_sha256: Option<String>,
-    /// The encoder's output.
-    #[serde(default = "defaults::image_embeddings")]
-    pub image_embeddings: String,
-    /// `[B, N, 2]` f32 (`efficient_sam`: `[1, B, N, 2]`), x and y.
-    #[serde(default = "defaults::point_coords")]
-    pub point_coords: String,
-    /// `[B, N]` f32 (`efficient_sam`: `[1, B, N]`): 1 in, 0 out, 2 and 3 corners, -1 none.
-    #[serde(default = "defaults::point_labels")]
-    pub point_labels: String,
-    /// `[1, 1, h, w]` f32, a former mask; none is given.
-    #[serde(default = "defaults::mask_input")]
-    pub mask_input: String,
-    /// `[1]` f32, 0.
-    #[serde(default = "defaults::has_mask_input")]
-    pub has_mask_input: String,
-    /// `[2]` f32 or i64, height and width of the photo.
-    #[serde(default = "defaults::orig_im_size")]
-    pub orig_im_size: String,
-    /// `[B, K, h, w]` f32 (`efficient_sam`: `[1, B, K, h, w]`), logits.
-    #[serde(default = "defaults::low_res_masks")]
-    pub low_res_masks: String,
-    /// `[B, K]` f32 (`efficient_sam`: `[1, B, K]`).
-    #[serde(default = "defaults::iou_predictions")]
-    pub iou_predictions: String,
+network! {
+    /// The prompt decoder of a mask network, with the names of its tensors; SAM's where not given.
+    /// Inputs that the file does not have are not fed.
+    #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct MaskDecoderManifest {
+        /// The encoder's output.
+        #[serde(default = "defaults::image_embeddings")]
+        pub image_embeddings: String,
+        /// `[B, N, 2]` f32 (`efficient_sam`: `[1, B, N, 2]`), x and y.
+        #[serde(default = "defaults::point_coords")]
+        pub point_coords: String,
+        /// `[B, N]` f32 (`efficient_sam`: `[1, B, N]`): 1 in, 0 out, 2 and 3 corners, -1 none.
+        #[serde(default = "defaults::point_labels")]
+        pub point_labels: String,
+        /// `[1, 1, h, w]` f32, a former mask; none is given.
+        #[serde(default = "defaults::mask_input")]
+        pub mask_input: String,
+        /// `[1]` f32, 0.
+        #[serde(default = "defaults::has_mask_input")]
+        pub has_mask_input: String,
+        /// `[2]` f32 or i64, height and width of the photo.
+        #[serde(default = "defaults::orig_im_size")]
+        pub orig_im_size: String,
+        /// `[B, K, h, w]` f32 (`efficient_sam`: `[1, B, K, h, w]`), logits.
+        #[serde(default = "defaults::low_res_masks")]
+        pub low_res_masks: String,
+        /// `[B, K]` f32 (`efficient_sam`: `[1, B, K]`).
+        #[serde(default = "defaults::iou_predictions")]
+        pub iou_predictions: String,
+    }
 }
 
 /// The pair of an image and a text tower in `bundle.toml`.
@@ -436,46 +451,40 @@ pub struct ImageTextManifest {
     pub words: Option<PlainFile>,
 }
 
-/// The image tower.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ImageTowerManifest {
-    /// File in the bundle's folder.
-    pub file: String,
-    /// Its sha256, hex.
-    pub sha256: String,
-    /// File of the weights that are not in `file`.
-    pub data: Option<String>,
-    /// Its sha256, hex.
-    pub data_sha256: Option<String>,
-    /// Input: `[B, 3, size, size]` f32.
-    pub input: String,
-    /// Output: `[B, dim]` f32, of any length.
-    pub output: String,
-    /// Side of a crop, pixels.
-    pub size: u32,
-    /// Subtracted from the 0..1 channels.
-    pub mean: [f32; 3],
-    /// Divides them after that.
-    pub std: [f32; 3],
-    /// Filter that brings a crop to that side.
-    #[serde(default)]
-    pub resize: ResizeFilter,
-    /// Added around a mask's box on each side, share of the box's longer side.
-    #[serde(default)]
-    pub crop_margin: f32,
-    /// What a crop shows of a box that is no square.
-    #[serde(default)]
-    pub crop_shape: CropShape,
-    /// Crops in one run, where the file takes several.
-    #[serde(default = "defaults::batch")]
-    pub batch: usize,
-    /// Most by which a device may differ from the CPU, root of mean squares, share of the answer;
-    /// a file of f16 needs more than the default.
-    #[serde(default = "defaults::tolerance")]
-    pub tolerance: f64,
-    /// What it says of whole photos; absent where it takes crops only.
-    pub dense: Option<DenseManifest>,
+network! {
+    /// The image tower.
+    #[derive(Clone, Debug, PartialEq, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct ImageTowerManifest {
+        /// Input: `[B, 3, size, size]` f32.
+        pub input: String,
+        /// Output: `[B, dim]` f32, of any length.
+        pub output: String,
+        /// Side of a crop, pixels.
+        pub size: u32,
+        /// Subtracted from the 0..1 channels.
+        pub mean: [f32; 3],
+        /// Divides them after that.
+        pub std: [f32; 3],
+        /// Filter that brings a crop to that side.
+        #[serde(default)]
+        pub resize: ResizeFilter,
+        /// Added around a mask's box on each side, share of the box's longer side.
+        #[serde(default)]
+        pub crop_margin: f32,
+        /// What a crop shows of a box that is no square.
+        #[serde(default)]
+        pub crop_shape: CropShape,
+        /// Crops in one run, where the file takes several.
+        #[serde(default = "defaults::batch")]
+        pub batch: usize,
+        /// Most by which a device may differ from the CPU, root of mean squares, share of the
+        /// answer; a file of f16 needs more than the default.
+        #[serde(default = "defaults::tolerance")]
+        pub tolerance: f64,
+        /// What it says of whole photos; absent where it takes crops only.
+        pub dense: Option<DenseManifest>,
+    }
 }
 
 /// The dense output of an image tower, which also takes whole photos.
@@ -527,37 +536,31 @@ impl DenseManifest {
     }
 }
 
-/// The text tower.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TextTowerManifest {
-    /// File in the bundle's folder.
-    pub file: String,
-    /// Its sha256, hex.
-    pub sha256: String,
-    /// File of the weights that are not in `file`.
-    pub data: Option<String>,
-    /// Its sha256, hex.
-    pub data_sha256: Option<String>,
-    /// Tokenizer file in the bundle's folder.
-    pub tokenizer: String,
-    /// Its sha256, hex.
-    pub tokenizer_sha256: String,
-    /// Most tokens of a text; a longer one is cut.
-    pub context: usize,
-    /// Token of a word that is not known.
-    #[serde(default = "defaults::unknown")]
-    pub unknown: String,
-    /// A word that the tokenizer cuts into pieces of fewer letters than this, on average, counts as
-    /// not known, unless `words` has it; 0: none does.
-    #[serde(default)]
-    pub piece_letters: f32,
-    /// Input: `[B, T]` i64.
-    pub input_ids: String,
-    /// Input: `[B, T]` i64, 1 for a token and 0 for padding; absent where the network has none.
-    pub attention_mask: Option<String>,
-    /// Output: `[B, dim]` f32, of any length.
-    pub output: String,
+network! {
+    /// The text tower.
+    #[derive(Clone, Debug, PartialEq, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct TextTowerManifest {
+        /// Tokenizer file in the bundle's folder.
+        pub tokenizer: String,
+        /// Its sha256, hex.
+        pub tokenizer_sha256: String,
+        /// Most tokens of a text; a longer one is cut.
+        pub context: usize,
+        /// Token of a word that is not known.
+        #[serde(default = "defaults::unknown")]
+        pub unknown: String,
+        /// A word that the tokenizer cuts into pieces of fewer letters than this, on average,
+        /// counts as not known, unless `words` has it; 0: none does.
+        #[serde(default)]
+        pub piece_letters: f32,
+        /// Input: `[B, T]` i64.
+        pub input_ids: String,
+        /// Input: `[B, T]` i64, 1 for a token and 0 for padding; absent where the network has none.
+        pub attention_mask: Option<String>,
+        /// Output: `[B, dim]` f32, of any length.
+        pub output: String,
+    }
 }
 
 /// The network that masks what a text says in `bundle.toml`: a photo is encoded once, and each text
@@ -590,59 +593,45 @@ pub struct TextMasksManifest {
     pub find: TextMasksFindManifest,
 }
 
-/// The image encoder of a network that masks what a text says.
-#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TextMasksImageManifest {
-    /// File in the bundle's folder.
-    pub file: String,
-    /// Its sha256, hex.
-    pub sha256: String,
-    /// File of the weights that are not in `file`.
-    pub data: Option<String>,
-    /// Its sha256, hex.
-    pub data_sha256: Option<String>,
-    /// Input: `[1, 3, size, size]` f32.
-    pub input: String,
-    /// Outputs, which the other file takes under the same names.
-    pub features: Vec<String>,
+network! {
+    /// The image encoder of a network that masks what a text says.
+    #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct TextMasksImageManifest {
+        /// Input: `[1, 3, size, size]` f32.
+        pub input: String,
+        /// Outputs, which the other file takes under the same names.
+        pub features: Vec<String>,
+    }
 }
 
-/// What finds a text in an encoded photo.
-#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TextMasksFindManifest {
-    /// File in the bundle's folder.
-    pub file: String,
-    /// Its sha256, hex.
-    pub sha256: String,
-    /// File of the weights that are not in `file`.
-    pub data: Option<String>,
-    /// Its sha256, hex.
-    pub data_sha256: Option<String>,
-    /// Tokenizer file in the bundle's folder.
-    pub tokenizer: String,
-    /// Its sha256, hex.
-    pub tokenizer_sha256: String,
-    /// Most tokens of a text; a longer one is cut.
-    pub context: usize,
-    /// Input: `[1, T]` i64.
-    pub input_ids: String,
-    /// Input: `[1, T]` i64, 1 for a token and 0 for padding; absent where the network has none.
-    pub attention_mask: Option<String>,
-    /// Output: `[1, Q, h, w]` f32, logits over the whole photo; over 0 is inside.
-    pub masks: String,
-    /// Output: `[1, Q]` f32, 0..1: how sure it is that the mask is what the text says.
-    pub scores: String,
+network! {
+    /// What finds a text in an encoded photo.
+    #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct TextMasksFindManifest {
+        /// Tokenizer file in the bundle's folder.
+        pub tokenizer: String,
+        /// Its sha256, hex.
+        pub tokenizer_sha256: String,
+        /// Most tokens of a text; a longer one is cut.
+        pub context: usize,
+        /// Input: `[1, T]` i64.
+        pub input_ids: String,
+        /// Input: `[1, T]` i64, 1 for a token and 0 for padding; absent where the network has none.
+        pub attention_mask: Option<String>,
+        /// Output: `[1, Q, h, w]` f32, logits over the whole photo; over 0 is inside.
+        pub masks: String,
+        /// Output: `[1, Q]` f32, 0..1: how sure it is that the mask is what the text says.
+        pub scores: String,
+    }
 }
 
 impl TextMasksManifest {
     pub(super) fn validate(&self, faults: &mut Faults) {
         let Self { image, find, .. } = self;
-        faults.file("text_masks.image", &image.file, &image.sha256);
-        faults.data("text_masks.image", &image.data, &image.data_sha256);
-        faults.file("text_masks.find", &find.file, &find.sha256);
-        faults.data("text_masks.find", &find.data, &find.data_sha256);
+        faults.network("text_masks.image", image.files());
+        faults.network("text_masks.find", find.files());
         faults.file("text_masks.find.tokenizer", &find.tokenizer, &find.tokenizer_sha256);
         faults.range("text_masks.size", self.size, 1..=BUCKET_SIDE_MAX);
         faults.channels("text_masks", self.mean, self.std);
@@ -655,48 +644,42 @@ impl TextMasksManifest {
     }
 }
 
-/// The feature network in `bundle.toml`.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct FeaturesManifest {
-    /// File in the bundle's folder.
-    pub file: String,
-    /// Its sha256, hex.
-    pub sha256: String,
-    /// File of the weights that are not in `file`.
-    pub data: Option<String>,
-    /// Its sha256, hex.
-    pub data_sha256: Option<String>,
-    /// Licence of the weights.
-    pub licence: String,
-    /// Where the weights come from.
-    pub source: String,
-    /// Input: `[1, 3, H, W]` f32.
-    pub input: String,
-    /// Output: `[N, 2]` f32, x and y in pixels of the input, best first; the centre of the top left
-    /// pixel is (0.5, 0.5).
-    pub keypoints: String,
-    /// Output: `[N]` f32, how good each is.
-    pub scores: String,
-    /// Output: `[N, dim]` f32, of length 1.
-    pub descriptors: String,
-    /// Longer side of a photo, pixels.
-    pub side: u32,
-    /// Both sides of a photo are whole multiples of this, pixels.
-    pub cell: u32,
-    /// Numbers of a descriptor.
-    pub dim: usize,
-    /// Most keypoints of a photo.
-    pub count: usize,
-    /// Two keypoints match only where the cosine of their descriptors is over this.
-    pub similarity_min: f32,
-    /// Filter that brings a photo to that size.
-    #[serde(default)]
-    pub resize: ResizeFilter,
-    /// Subtracted from the 0..1 channels.
-    pub mean: [f32; 3],
-    /// Divides them after that.
-    pub std: [f32; 3],
+network! {
+    /// The feature network in `bundle.toml`.
+    #[derive(Clone, Debug, PartialEq, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct FeaturesManifest {
+        /// Licence of the weights.
+        pub licence: String,
+        /// Where the weights come from.
+        pub source: String,
+        /// Input: `[1, 3, H, W]` f32.
+        pub input: String,
+        /// Output: `[N, 2]` f32, x and y in pixels of the input, best first; the centre of the top
+        /// left pixel is (0.5, 0.5).
+        pub keypoints: String,
+        /// Output: `[N]` f32, how good each is.
+        pub scores: String,
+        /// Output: `[N, dim]` f32, of length 1.
+        pub descriptors: String,
+        /// Longer side of a photo, pixels.
+        pub side: u32,
+        /// Both sides of a photo are whole multiples of this, pixels.
+        pub cell: u32,
+        /// Numbers of a descriptor.
+        pub dim: usize,
+        /// Most keypoints of a photo.
+        pub count: usize,
+        /// Two keypoints match only where the cosine of their descriptors is over this.
+        pub similarity_min: f32,
+        /// Filter that brings a photo to that size.
+        #[serde(default)]
+        pub resize: ResizeFilter,
+        /// Subtracted from the 0..1 channels.
+        pub mean: [f32; 3],
+        /// Divides them after that.
+        pub std: [f32; 3],
+    }
 }
 
 impl FeaturesManifest {
@@ -707,8 +690,7 @@ impl FeaturesManifest {
     }
 
     pub(super) fn validate(&self, faults: &mut Faults) {
-        faults.file("features", &self.file, &self.sha256);
-        faults.data("features", &self.data, &self.data_sha256);
+        faults.network("features", self.files());
         faults.range("features.cell", self.cell, 1..=BUCKET_SIDE_MAX);
         faults.range("features.side", self.side, self.cell.max(1)..=BUCKET_SIDE_MAX);
         faults.range("features.dim", self.dim, 1..=DIM_MAX);
@@ -718,43 +700,36 @@ impl FeaturesManifest {
     }
 }
 
-/// The network that matches keypoints in `bundle.toml`.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct MatcherManifest {
-    /// File in the bundle's folder.
-    pub file: String,
-    /// Its sha256, hex.
-    pub sha256: String,
-    /// File of the weights that are not in `file`.
-    pub data: Option<String>,
-    /// Its sha256, hex.
-    pub data_sha256: Option<String>,
-    /// Licence of the weights.
-    pub licence: String,
-    /// Where the weights come from.
-    pub source: String,
-    /// Inputs of the first and of the second photo: `[N, 2]` f32, x and y from the middle of the
-    /// photo, halves of its longer side.
-    pub keypoints: [String; 2],
-    /// Inputs: `[N, dim]` f32, the descriptors of `[features]`.
-    pub descriptors: [String; 2],
-    /// Output: `[N]` f32 for each keypoint of the first photo, the place of its match among those
-    /// of the second; -1: none.
-    pub matches: String,
-    /// Output: `[N]` f32, how sure each match is, 0..1.
-    pub scores: String,
-    /// Most keypoints of a photo, the best of those that there are.
-    pub count: usize,
-    /// A match counts where its score is over this.
-    pub score_min: f32,
+network! {
+    /// The network that matches keypoints in `bundle.toml`.
+    #[derive(Clone, Debug, PartialEq, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct MatcherManifest {
+        /// Licence of the weights.
+        pub licence: String,
+        /// Where the weights come from.
+        pub source: String,
+        /// Inputs of the first and of the second photo: `[N, 2]` f32, x and y from the middle of
+        /// the photo, halves of its longer side.
+        pub keypoints: [String; 2],
+        /// Inputs: `[N, dim]` f32, the descriptors of `[features]`.
+        pub descriptors: [String; 2],
+        /// Output: `[N]` f32 for each keypoint of the first photo, the place of its match among
+        /// those of the second; -1: none.
+        pub matches: String,
+        /// Output: `[N]` f32, how sure each match is, 0..1.
+        pub scores: String,
+        /// Most keypoints of a photo, the best of those that there are.
+        pub count: usize,
+        /// A match counts where its score is over this.
+        pub score_min: f32,
+    }
 }
 
 impl MatcherManifest {
     /// `features`: whether the bundle has the network whose keypoints are matched.
     pub(super) fn validate(&self, features: bool, faults: &mut Faults) {
-        faults.file("matcher", &self.file, &self.sha256);
-        faults.data("matcher", &self.data, &self.data_sha256);
+        faults.network("matcher", self.files());
         faults.range("matcher.count", self.count, 1..=KEYPOINTS_MAX);
         faults.range("matcher.score_min", self.score_min, 0.0..=1.0);
         if !features {
@@ -763,49 +738,44 @@ impl MatcherManifest {
     }
 }
 
-/// The network that says where photos were taken in `bundle.toml`.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct CamerasManifest {
-    /// File in the bundle's folder.
-    pub file: String,
-    /// Its sha256, hex.
-    pub sha256: String,
-    /// File of the weights that are not in `file`.
-    pub data: Option<String>,
-    /// Its sha256, hex.
-    pub data_sha256: Option<String>,
-    /// Licence of the weights.
-    pub licence: String,
-    /// Where the weights come from.
-    pub source: String,
-    /// Input: `[V, 3, H, W]` f32, photos of one shape.
-    pub input: String,
-    /// Output: `[V, 3, 4]` f32, world to camera, of one world and scale.
-    pub world_to_camera: String,
-    /// Output: `[V, 3, 3]` f32, pixels of the input.
-    pub intrinsics: String,
-    /// Output: `[V, H, W]` f32, depths in the scale of the cameras; absent where the network gives
-    /// none. For callers that run the network by itself.
-    pub depth: Option<String>,
-    /// Output: `[V, H, W]` f32, how sure each depth is.
-    pub depth_confidence: Option<String>,
-    /// Most photos of a run.
-    pub views_max: usize,
-    /// Longer side of a photo, pixels.
-    pub side: u32,
-    /// Both sides of a photo are whole multiples of this, pixels.
-    pub cell: u32,
-    /// Filter that brings a photo to that size.
-    #[serde(default)]
-    pub resize: ResizeFilter,
-    /// Subtracted from the 0..1 channels.
-    pub mean: [f32; 3],
-    /// Divides them after that.
-    pub std: [f32; 3],
-    /// Most by which a device may differ from the CPU, root of mean squares, share of the answer.
-    #[serde(default = "defaults::tolerance")]
-    pub tolerance: f64,
+network! {
+    /// The network that says where photos were taken in `bundle.toml`.
+    #[derive(Clone, Debug, PartialEq, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct CamerasManifest {
+        /// Licence of the weights.
+        pub licence: String,
+        /// Where the weights come from.
+        pub source: String,
+        /// Input: `[V, 3, H, W]` f32, photos of one shape.
+        pub input: String,
+        /// Output: `[V, 3, 4]` f32, world to camera, of one world and scale.
+        pub world_to_camera: String,
+        /// Output: `[V, 3, 3]` f32, pixels of the input.
+        pub intrinsics: String,
+        /// Output: `[V, H, W]` f32, depths in the scale of the cameras; absent where the network
+        /// gives none. For callers that run the network by itself.
+        pub depth: Option<String>,
+        /// Output: `[V, H, W]` f32, how sure each depth is.
+        pub depth_confidence: Option<String>,
+        /// Most photos of a run.
+        pub views_max: usize,
+        /// Longer side of a photo, pixels.
+        pub side: u32,
+        /// Both sides of a photo are whole multiples of this, pixels.
+        pub cell: u32,
+        /// Filter that brings a photo to that size.
+        #[serde(default)]
+        pub resize: ResizeFilter,
+        /// Subtracted from the 0..1 channels.
+        pub mean: [f32; 3],
+        /// Divides them after that.
+        pub std: [f32; 3],
+        /// Most by which a device may differ from the CPU, root of mean squares, share of the
+        /// answer.
+        #[serde(default = "defaults::tolerance")]
+        pub tolerance: f64,
+    }
 }
 
 impl CamerasManifest {
@@ -817,8 +787,7 @@ impl CamerasManifest {
 
     /// `features`: whether the bundle has the network whose keypoints judge the cameras.
     pub(super) fn validate(&self, features: bool, faults: &mut Faults) {
-        faults.file("cameras", &self.file, &self.sha256);
-        faults.data("cameras", &self.data, &self.data_sha256);
+        faults.network("cameras", self.files());
         faults.range("cameras.views_max", self.views_max, 2..=VIEWS_MAX);
         faults.range("cameras.cell", self.cell, 1..=BUCKET_SIDE_MAX);
         faults.range("cameras.side", self.side, self.cell.max(1)..=BUCKET_SIDE_MAX);
@@ -906,11 +875,12 @@ impl Faults {
         }
     }
 
-    /// The file of weights beside it: both keys or none.
-    fn data(&mut self, section: &str, data: &Option<String>, sha256: &Option<String>) {
-        match (data, sha256) {
-            (Some(file), Some(sha256)) => self.file(&format!("{section}.data"), file, sha256),
-            (None, None) => {}
+    /// A network: its file, and one of weights beside it with both keys or none.
+    fn network(&mut self, section: &str, ([file, sha256], data): Files<'_>) {
+        self.file(section, file, sha256);
+        match data {
+            [Some(file), Some(sha256)] => self.file(&format!("{section}.data"), file, sha256),
+            [None, None] => {}
             _ => self.0.push(format!("{section}.data and data_sha256 go together")),
         }
     }
@@ -941,10 +911,8 @@ impl Faults {
 impl MasksManifest {
     pub(super) fn validate(&self, faults: &mut Faults) {
         let (encoder, decoder) = (&self.encoder, &self.decoder);
-        faults.file("masks.encoder", &encoder.file, &encoder.sha256);
-        faults.data("masks.encoder", &encoder.data, &encoder.data_sha256);
-        faults.file("masks.decoder", &decoder.file, &decoder.sha256);
-        faults.data("masks.decoder", &decoder.data, &decoder.data_sha256);
+        faults.network("masks.encoder", encoder.files());
+        faults.network("masks.decoder", decoder.files());
         faults.range("masks.size", self.size, 1..=BUCKET_SIDE_MAX);
         faults.channels("masks", self.mean, self.std);
         if self.levels.is_empty() || self.levels.iter().any(|&level| level > 15) {
@@ -980,13 +948,11 @@ impl MasksManifest {
 impl ImageTextManifest {
     pub(super) fn validate(&self, faults: &mut Faults) {
         let (image, text) = (&self.image, &self.text);
-        faults.file("image_text.image", &image.file, &image.sha256);
-        faults.data("image_text.image", &image.data, &image.data_sha256);
-        faults.file("image_text.text", &text.file, &text.sha256);
-        faults.data("image_text.text", &text.data, &text.data_sha256);
+        faults.network("image_text.image", image.files());
+        faults.network("image_text.text", text.files());
         faults.file("image_text.text.tokenizer", &text.tokenizer, &text.tokenizer_sha256);
         if let Some(words) = &self.words {
-            faults.file("image_text.words", &words.file, &words.sha256);
+            faults.network("image_text.words", words.files());
         }
         faults.range("image_text.image.size", image.size, 1..=BUCKET_SIDE_MAX);
         faults.channels("image_text.image", image.mean, image.std);

@@ -5,7 +5,7 @@ use std::{
     sync::atomic::AtomicBool,
 };
 
-use image::{DynamicImage, ImageBuffer, ImageFormat, Rgb, RgbImage};
+use image::{DynamicImage, ImageBuffer, ImageEncoder as _, ImageFormat, Rgb, RgbImage};
 
 use segsplat_core::{
     error::ErrorCode,
@@ -734,16 +734,15 @@ fn real_scenes_are_read_with_their_distortion_undone() {
 
 /// A JPEG whose EXIF says how it is to be turned.
 fn with_orientation(image: &DynamicImage, orientation: u8) -> Vec<u8> {
-    let mut jpeg = Cursor::new(Vec::new());
-    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 97).encode_image(image).unwrap();
+    let mut jpeg = Vec::new();
+    let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 97);
     let tiff = [
         &b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0"[..],
         &[orientation, 0, 0, 0, 0, 0, 0, 0],
-    ]
-    .concat();
-    let length = (tiff.len() as u16 + 8).to_be_bytes();
-    let jpeg = jpeg.into_inner();
-    [&jpeg[..2], b"\xFF\xE1", &length, b"Exif\0\0", &tiff, &jpeg[2..]].concat()
+    ];
+    encoder.set_exif_metadata(tiff.concat()).unwrap();
+    encoder.encode_image(image).unwrap();
+    jpeg
 }
 
 /// Mean difference of the pixels of two photos, of 255.
