@@ -46,6 +46,19 @@ pub(crate) struct Grown {
     pub(crate) agrees: Vec<Vec<bool>>,
 }
 
+impl Grown {
+    /// The points of tracks, each with the sightings that agree with it.
+    pub(crate) fn seen<'a>(
+        &'a self,
+        tracks: &'a [Vec<Sighting>],
+    ) -> impl Iterator<Item = (&'a Vector3<f64>, impl Iterator<Item = Sighting> + Clone)> {
+        tracks.iter().zip(&self.agrees).zip(&self.points).filter_map(|((track, agrees), point)| {
+            let near = track.iter().zip(agrees).filter(|(_, agrees)| **agrees);
+            Some((point.as_ref()?, near.map(|(sighting, _)| *sighting)))
+        })
+    }
+}
+
 /// The growing state and what it grows on.
 pub(crate) struct Grower<'a> {
     pub(crate) survey: &'a Survey,
@@ -136,13 +149,8 @@ impl<'a> Grower<'a> {
 
     /// Sightings, of those that agreed before, that still do.
     pub(crate) fn agreeing(&self) -> usize {
-        let tracks = self.tracks.iter().zip(&self.state.agrees).zip(&self.state.points);
-        let each = tracks.filter_map(|(track, point)| Some((track, point.as_ref()?)));
-        let near = each.map(|((track, agrees), point)| {
-            let own = track.iter().zip(agrees).filter(|(_, agrees)| **agrees);
-            own.filter(|(sighting, _)| self.error2(**sighting, point) < 1.0).count()
-        });
-        near.sum()
+        let seen = self.state.seen(self.tracks);
+        seen.map(|(point, near)| near.filter(|s| self.error2(*s, point) < 1.0).count()).sum()
     }
 
     /// Known points that each unplaced photo may see.

@@ -76,11 +76,9 @@ fn placed(best: &Candidate) -> impl Iterator<Item = usize> + '_ {
 /// Points of each photo that two more photos see.
 pub(crate) fn points(best: &Candidate) -> Vec<usize> {
     let mut points = vec![0; best.grown.poses.len()];
-    let tracks = best.tracks.iter().zip(&best.grown.agrees).zip(&best.grown.points);
-    for ((track, agrees), _) in tracks.filter(|(_, point)| point.is_some()) {
-        let near = track.iter().zip(agrees).filter(|(_, agrees)| **agrees);
+    for (_, near) in best.grown.seen(&best.tracks) {
         if near.clone().count() >= 3 {
-            near.for_each(|(sighting, _)| points[sighting.0 as usize] += 1);
+            near.for_each(|sighting| points[sighting.0 as usize] += 1);
         }
     }
     points

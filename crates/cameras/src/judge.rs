@@ -172,11 +172,8 @@ pub(crate) fn evidence(
     let held = held::points(best);
     let mut angles = Vec::new();
     let mut errors = Vec::new();
-    for ((track, agrees), point) in best.tracks.iter().zip(&grown.agrees).zip(&grown.points) {
-        let Some(point) = point else { continue };
-        let near: Vec<_> = track.iter().zip(agrees).filter(|(_, a)| **a).map(|(s, _)| s).collect();
+    for (point, near) in grown.seen(&best.tracks) {
         let rays: Vec<Vector3<f64>> = near
-            .iter()
             .filter_map(|s| {
                 let photo = s.0 as usize;
                 let view = &survey.views[photo];
@@ -271,20 +268,15 @@ fn missing(survey: &Survey, best: &Candidate, links: &[Link]) -> f64 {
 /// Points, seen by one of the two photos, that both could see from nearly the same side.
 fn points_in_both(survey: &Survey, best: &Candidate, ends: [(usize, &Pose); 2]) -> usize {
     let grown = &best.grown;
-    let tracks = best.tracks.iter().zip(&grown.agrees).zip(&grown.points);
-    let seen = tracks.filter(|((track, agrees), point)| {
-        let Some(point) = point else { return false };
-        let own = track.iter().zip(*agrees);
-        let by_one = own
-            .filter(|(_, agrees)| **agrees)
-            .any(|(s, _)| ends.iter().any(|(photo, _)| *photo == s.0 as usize));
+    let seen = grown.seen(&best.tracks).filter(|(point, near)| {
+        let by_one = near.clone().any(|s| ends.iter().any(|(photo, _)| *photo == s.0 as usize));
         let inside = |(photo, pose): (usize, &Pose)| {
             let view = &survey.views[photo];
             let pixel = grown.lenses[view.lens].project(&pose.seen(point));
             pixel.is_some_and(|p| p.x.abs() < 0.5 * view.size[0] && p.y.abs() < 0.5 * view.size[1])
         };
-        let rays = ends.map(|(_, pose)| (point - pose.center()).normalize());
-        let lengths = ends.map(|(_, pose)| (point - pose.center()).norm());
+        let rays = ends.map(|(_, pose)| (*point - pose.center()).normalize());
+        let lengths = ends.map(|(_, pose)| (*point - pose.center()).norm());
         let scale = lengths[0] / lengths[1];
         by_one
             && ends.into_iter().all(inside)

@@ -90,11 +90,10 @@ pub(crate) fn outcome(
     let frame = Frame::of(&grown.poses, &known);
     let mut fits = vec![(0_usize, 0.0); photos.len()];
     let mut points = Vec::with_capacity(known.len());
-    for ((track, agrees), point) in best.tracks.iter().zip(&grown.agrees).zip(&grown.points) {
-        let Some(point) = point else { continue };
+    for (point, near) in grown.seen(&best.tracks) {
         let mut own = Vec::new();
         let mut sum = 0.0;
-        for (sighting, _) in track.iter().zip(agrees).filter(|(_, agrees)| **agrees) {
+        for sighting in near {
             let photo = sighting.0 as usize;
             let view = &survey.views[photo];
             let Some(pose) = &grown.poses[photo] else { continue };
@@ -105,7 +104,7 @@ pub(crate) fn outcome(
             fits[photo].0 += 1;
             fits[photo].1 += error2;
             sum += error2;
-            own.push(*sighting);
+            own.push(sighting);
         }
         let error_px = (sum / own.len().max(1) as f64).sqrt();
         points.push(SeenPoint { position: frame.point(point).into(), track: own, error_px });
