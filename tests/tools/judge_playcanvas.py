@@ -1,4 +1,4 @@
-"""PlayCanvas' engine, in a headless Chromium, streams the levels of detail that this program writes:
+"""PlayCanvas' engine, in a headless Chromium, streams levels of detail that this program writes:
 its asset `gsplat` of `lod-meta.json` in the unpacked folder of a `.sog.zip`. Its picture of the
 finest level is held to ours of the same scene; coarser ones are near it. `make judge-playcanvas`
 gets the engine and the browser's driver.
