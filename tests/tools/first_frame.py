@@ -113,7 +113,7 @@ def main() -> None:
         first_ms, known, count = page.evaluate(FIRST, WAIT_MS)
         came = dict(seen)
         line_s = came["bytes"] * 8 / given.mbit / 1e6
-        print(f"{given.gaussians} Gaussians at {given.mbit:g} Mbit/s (load {load:.0f}): first frame "
+        print(f"{given.gaussians} Gaussians, {given.mbit:g} Mbit/s (load {load:.0f}): first frame "
               f"after {first_ms / 1000:.2f} s, of {known} Gaussians; {came['requests']} requests "
               f"and {came['bytes'] / MB:.2f} MB until then, {line_s:.2f} s of the line", flush=True)
         settled(page)
@@ -121,8 +121,8 @@ def main() -> None:
         heap = page.evaluate("performance.memory.usedJSHeapSize") / MB
         rows = page.evaluate("segsplat.drawing.rows")
         processes = ", ".join(f"{kind} {most:.0f} MB" for kind, most in memory().items())
-        print(f"settled after {took:.0f} s; {count} of {given.gaussians} have room; heap {heap:.0f} "
-              f"MB, textures {rows * 2048 * 68 / MB:.0f} MB; most resident memory of processes: "
+        print(f"settled after {took:.0f} s; {count} of {given.gaussians} have room; heap {heap:.0f}"
+              f" MB, textures {rows * 2048 * 68 / MB:.0f} MB; most resident memory of processes: "
               f"{processes}", flush=True)
         # What comes in three seconds beside the page itself.
         length = int.from_bytes(packed[:4], "little")
@@ -144,8 +144,8 @@ def main() -> None:
         need = (own + first) / MB
         db = 10 * np.log10(255**2 / error)
         print(f"the page ({own / MB:.2f} MB) and the coarsest form are {need:.2f} MB, "
-              f"{need * 8 / given.mbit:.2f} s of the line; after {SECONDS:g} s {end / MB:.2f} MB of "
-              f"{len(packed) / MB:.1f} are there: {db:.1f} dB")
+              f"{need * 8 / given.mbit:.2f} s of the line; after {SECONDS:g} s {end / MB:.2f} MB of"
+              f" {len(packed) / MB:.1f} are there: {db:.1f} dB")
 
 
 if __name__ == "__main__":
