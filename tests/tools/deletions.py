@@ -38,7 +38,9 @@ def psnr(before: np.ndarray, after: np.ndarray, where: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / max(error, 1e-9)))
 
 
-def made(client: segsplat.Client, folder: Path) -> tuple[segsplat.Scene, list[str]]:
+def made(
+    client: segsplat.Client, folder: Path, semantics: str = "eager"
+) -> tuple[segsplat.Scene, list[str]]:
     """A scene of every third photo, and the names of their masks."""
     told = json.loads((folder / "transforms.json").read_text())
     frames = told["frames"][: 3 * PHOTOS : 3]
@@ -50,7 +52,7 @@ def made(client: segsplat.Client, folder: Path) -> tuple[segsplat.Scene, list[st
             shutil.copy(folder / "images" / name, to / "images")
             frame["file_path"] = f"images/{name}"
         (to / "transforms.json").write_text(json.dumps({**told, "frames": frames}))
-        scene = client.scene(to, semantics="eager", progress=False)
+        scene = client.scene(to, semantics=semantics, progress=False)
     return scene, [Path(frame["file_path"]).name for frame in frames]
 
 

@@ -4,10 +4,11 @@
     PYTHONPATH=clients/python/src SEGSPLAT_BIN=target/release/segsplat \\
         python tests/tools/distances.py --photos 8 --refine 20000 target/eval/scenes/scene_*
 
-The rooms are in metres and their floor is y = 0, so a pixel of the floor has an exact place. Their
-cameras are sent in units of 0.27 m. Points of the floor are picked in each photo; the length
-between the two that are farthest apart is given, and all other distances over half a metre are
-compared.
+The rooms are in metres, and where each pixel is, is known (`rooms.py`). Their cameras are sent in
+units of 0.27 m. Points of surfaces (`--on floor`; also `wall`, and `table`: its top) are picked in
+each photo. Of the first surface that has four points, the length between the two that are farthest
+apart is given; all other distances on a surface over half a metre (of the table: over 0.1 m) are
+compared; also with the unit known, and of places that two photos and more show.
 Of the ground: how many degrees its normal is off, and its height at its middle.
 """
 
@@ -22,10 +23,13 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from rooms import Rooms, places, seen_by
 
 import segsplat
 
-GRID, UNIT, SHORT = 5, 0.27, 0.5
+GRID, UNIT = 5, 0.27
+# Shorter distances are not compared, metres.
+SHORT = {"floor": 0.5, "wall": 0.5, "table": 0.1}
 
 
 def made(
@@ -54,25 +58,79 @@ def made(
     return scene, frames, told
 
 
-def floor_points(scene: segsplat.Scene, folder: Path, frames: list[dict], told: dict) -> np.ndarray:
-    """[N, 2, 3] picked and true places of pixels of the floor."""
+def points_on(
+    surface: str,
+    scene: segsplat.Scene,
+    folder: Path,
+    told: dict,
+    seen: list[tuple[dict, np.ndarray]],
+) -> tuple[np.ndarray, np.ndarray]:
+    """[N, 2, 3] picked and true places of pixels of a surface, and how many photos show each;
+    `seen` has each frame and its true depths."""
     classes = json.loads((folder / "masks/classes.json").read_text())
-    floor = next(int(value) for value, word in classes.items() if word == "floor")
-    found = []
-    for i, frame in enumerate(frames):
-        mask = np.asarray(Image.open(folder / "masks" / Path(frame["file_path"]).name)) == floor
-        pose = np.array(frame["transform_matrix"])
+    value = {word: int(value) for value, word in classes.items()}.get(surface)
+    masks = [np.asarray(Image.open(folder / "masks" / Path(frame["file_path"]).name)) == value
+             for frame, _ in seen]
+    at = [places(frame, told, depth) for frame, depth in seen]
+    if surface == "table" and np.any(masks):
+        # Its top, and not its sides and legs.
+        top = min(at[mask][:, 1].min() for mask, at in zip(masks, at, strict=True) if mask.any())
+        masks = [mask & (at[..., 1] < top + 1e-3) for mask, at in zip(masks, at, strict=True)]
+    found, shown = [], []
+    for i, mask in enumerate(masks):
+        height, width = mask.shape
         for u, v in itertools.product(range(1, 2 * GRID, 2), repeat=2):
-            x, y = told["w"] * u // (2 * GRID), told["h"] * v // (2 * GRID)
+            x, y = width * u // (2 * GRID), height * v // (2 * GRID)
             if not mask[y - 3 : y + 4, x - 3 : x + 4].all():
                 continue
-            at = (x + 0.5 - told["cx"]) / told["fl_x"], (y + 0.5 - told["cy"]) / told["fl_y"]
-            ray = pose[:3, :3] @ np.array([at[0], -at[1], -1.0])  # OpenGL camera axes
-            true = pose[:3, 3] - ray * (pose[1, 3] / ray[1])
             point = scene.pick(x + 0.5, y + 0.5, from_=i).point
             if point is not None:
+                true = at[i][y, x]
                 found.append((np.array(point), true))
-    return np.array(found)
+                shown.append(sum(seen_by(frame, told, depth, true) for frame, depth in seen))
+    return np.array(found), np.array(shown)
+
+
+def between(points: np.ndarray) -> np.ndarray:
+    """[N, N] true distances."""
+    return np.linalg.norm(points[:, None, 1] - points[None, :, 1], axis=-1)
+
+
+def scaled(scene: segsplat.Scene, points: np.ndarray) -> tuple[segsplat.Scale, str]:
+    """The size after the longest of the distances is given, and what is said of it."""
+    true = between(points)
+    ends = list(np.unravel_index(true.argmax(), true.shape))
+    scale = scene.set_scale(float(true.max()), points=points[ends, 0].tolist())
+    ground, said = scale.ground, "no ground"
+    if ground is not None:
+        off = np.degrees(np.arccos(np.clip(-ground.normal[1], -1, 1)))
+        said = f"ground {off:.2f} degrees off, {-ground.point[1] * UNIT:+.3f} m"
+    return scale, f"a unit is {scale.metres_per_unit:.4f} m ({UNIT}); {said}"
+
+
+def compared(
+    scene: segsplat.Scene, scale: segsplat.Scale, points: np.ndarray, short: float, given: bool
+) -> tuple[list[float], list[float]]:
+    """How much distances between the points are off, by the given length and with the unit known.
+    Where it is `given` on this surface, that length itself is left out."""
+    true, of, known = between(points), [], []
+    for i, j in itertools.combinations(range(len(points)), 2):
+        if true[i, j] > short and not (given and true[i, j] == true.max()):
+            units = np.linalg.norm(points[i, 0] - points[j, 0])
+            of.append(abs(scale.metres_per_unit * units / true[i, j] - 1))
+            known.append(abs(UNIT * units / true[i, j] - 1))
+    # What the server says of the first and the last of them.
+    units = float(np.linalg.norm(points[0, 0] - points[-1, 0]))
+    said = scene.measure(points[[0, -1], 0].tolist()).length
+    assert np.isclose(said, scale.metres_per_unit * units), (said, scale, units)
+    return of, known
+
+
+def told_of(errors: list[float], known: list[float]) -> str:
+    share = 100 * np.quantile(errors, [0.5, 0.9, 1])
+    return (f"{len(errors)} distances, off by {share[0]:.2f} % (median), {share[1]:.2f} (of 9 in "
+            f"10), {share[2]:.2f} (most), {100 * np.mean(np.array(errors) <= 0.01):.0f} % within "
+            f"1 %; with the unit known {100 * np.median(known):.2f} % (median)")
 
 
 def main() -> None:
@@ -80,37 +138,39 @@ def main() -> None:
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--photos", type=int, default=4)
     parser.add_argument("--refine", type=int, default=0, help="milliseconds")
+    parser.add_argument("--on", nargs="+", choices=SHORT, default=["floor"])
     given = parser.parse_args()
-    everything = []
+    rooms = Rooms()
+    all_of: dict[tuple[str, int], tuple[list[float], list[float]]] = {}
     with segsplat.local(flags=["--renderer", "cpu"], env={"SEGSPLAT_REFINE": "off"}) as client:
         for folder in given.folders:
             scene, frames, told = made(client, folder, given.photos, given.refine)
-            points = floor_points(scene, folder, frames, told)
-            if len(points) < 4:
-                print(f"{folder.name}: {len(points)} points of the floor are too few", flush=True)
-                continue
-            true = np.linalg.norm(points[:, None, 1] - points[None, :, 1], axis=-1)
-            a, b = np.unravel_index(true.argmax(), true.shape)
-            scale = scene.set_scale(float(true[a, b]), points=points[[a, b], 0].tolist())
-            errors = []
-            for i, j in itertools.combinations(range(len(points)), 2):
-                if true[i, j] > SHORT and {i, j} != {a, b}:
-                    got = scene.measure(points[[i, j], 0].tolist()).length
-                    errors.append(abs(got / true[i, j] - 1))
-            everything += errors
-            ground, said = scale.ground, "no ground"
-            if ground is not None:
-                off = np.degrees(np.arccos(np.clip(-ground.normal[1], -1, 1)))
-                said = f"ground {off:.2f} degrees off, {-ground.point[1] * UNIT:+.3f} m"
-            share = 100 * np.quantile(errors, [0.5, 0.9, 1])
-            print(f"{folder.name}: {len(points)} points, {len(errors)} distances, off by "
-                  f"{share[0]:.2f} % (median), {share[1]:.2f} (of 9 in 10), {share[2]:.2f} (most); "
-                  f"a unit is {scale.metres_per_unit:.4f} m ({UNIT}); {said}", flush=True)
+            number = int(folder.name.removeprefix("scene_"))
+            seen = [(frame, rooms.seen(number, frame, told)) for frame in frames]
+            scale = None
+            for on in given.on:
+                points, shown = points_on(on, scene, folder, told, seen)
+                if len(points) < 4:
+                    print(f"{folder.name} {on}: {len(points)} points are too few", flush=True)
+                    continue
+                first = scale is None
+                if scale is None:
+                    scale, said = scaled(scene, points)
+                    print(f"{folder.name}: {said}", flush=True)
+                for least in (1, 2):
+                    some = points[shown >= least]
+                    if len(some) < 4:
+                        continue
+                    errors = compared(scene, scale, some, SHORT[on], first)
+                    print(f"{folder.name} {on}: {len(some)} points that {least} photos and more "
+                          f"show, {told_of(*errors)}", flush=True)
+                    for all_errors, of in zip(
+                        all_of.setdefault((on, least), ([], [])), errors, strict=True
+                    ):
+                        all_errors.extend(of)
             scene.delete()
-    share = 100 * np.quantile(everything, [0.5, 0.9, 1])
-    within = 100 * np.mean(np.array(everything) <= 0.01)
-    print(f"all: {len(everything)} distances, off by {share[0]:.2f} % (median), {share[1]:.2f} (of "
-          f"9 in 10), {share[2]:.2f} (most); {within:.0f} % within 1 %")
+    for (on, least), errors in all_of.items():
+        print(f"all {on}, {least} photos and more: {told_of(*errors)}")
 
 
 if __name__ == "__main__":

@@ -174,6 +174,14 @@ impl Blocks {
         all.filter(|&at| self.is_shown(at as usize, frustum)).collect()
     }
 
+    /// The scene's own Gaussians of the blocks that the view shows, ascending.
+    pub fn near(&self, frustum: &Frustum) -> Vec<u32> {
+        let shown = (0..self.own).filter(|&at| frustum.may_show(&self.bounds[at]));
+        let mut ids: Vec<u32> = shown.flat_map(|at| self.ids(at)).copied().collect();
+        ids.sort_unstable();
+        ids
+    }
+
     /// Whether the view shows block `at`: it may touch the picture and is fine enough, and the
     /// block that stands for it is not. Of each Gaussian one block of those that it is merged in is
     /// shown, or none where that cannot touch the picture.
@@ -251,6 +259,14 @@ impl Frustum {
             widens,
             detail: f64::from(request.detail) / view.pixels_per_step(),
         }
+    }
+
+    /// That of what is within `by` pixels of a place of the picture, or beside the picture.
+    pub fn around(view: &View, request: &RenderRequest, at: [f64; 2], by: f64) -> Self {
+        let low = at.map(|at| (at - by).floor());
+        let [width, height] = [0, 1].map(|k| ((at[k] + by).ceil() - low[k]) as u32);
+        let principal = [0, 1].map(|k| view.principal[k] - low[k]);
+        Self::new(&View { principal, width, height, ..*view }, request)
     }
 
     /// Whether the Gaussians of a block may be drawn in place of those that they stand for: they

@@ -175,7 +175,8 @@ pub struct Contribution {
     pub weight: f64,
 }
 
-/// What each Gaussian adds to one pixel of the whole picture (column, row), front to back.
+/// What each Gaussian adds to one pixel of the whole picture (column, row), front to back. `among`
+/// are those that are asked, ascending, or all.
 ///
 /// # Errors
 /// `invalid_request` when the intrinsics are unusable.
@@ -183,12 +184,12 @@ pub fn contributions(
     gaussians: &Gaussians,
     request: &RenderRequest,
     pixel: [u32; 2],
+    among: Option<&[u32]>,
 ) -> Result<Vec<Contribution>> {
     let lens = request.camera.intrinsics.validated("camera")?;
     let [x, y] = pixel.map(|at| f64::from(at) + 0.5);
     let center = DVec2::new(x, y);
-    let mut near: Vec<(usize, Splat)> = (0..gaussians.len())
-        .into_par_iter()
+    let mut near: Vec<(usize, Splat)> = numbers(gaussians, among)
         .filter(|&i| may_reach(gaussians, i, request, &lens, center))
         .filter_map(|i| Some((i, splat(gaussians, i, request, &lens)?)))
         .filter(|(_, splat)| splat.alpha(center) >= f64::from(ALPHA_MIN))
@@ -206,6 +207,15 @@ pub fn contributions(
         transmittance = next;
     }
     Ok(found)
+}
+
+/// The numbers of some Gaussians, or of all.
+pub(crate) fn numbers<'a>(
+    gaussians: &Gaussians,
+    among: Option<&'a [u32]>,
+) -> impl IndexedParallelIterator<Item = usize> + use<'a> {
+    let count = among.map_or(gaussians.len(), <[u32]>::len);
+    (0..count).into_par_iter().map(move |at| among.map_or(at, |ids| ids[at] as usize))
 }
 
 /// Whether a Gaussian may add to a place: `false` only where [`splat`] gives none, or one whose

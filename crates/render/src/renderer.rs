@@ -55,6 +55,21 @@ pub trait Renderer: Send + Sync {
         Ok(())
     }
 
+    /// The Gaussians that may touch what is within `by` pixels of a place of the picture, or beside
+    /// the picture, ascending; others may be among them. `None`: all, as it has none in blocks.
+    ///
+    /// # Errors
+    /// As [`Self::render`].
+    fn near(
+        &self,
+        _gaussians: &Gaussians,
+        _request: &RenderRequest,
+        _at: [f64; 2],
+        _by: f64,
+    ) -> Result<Option<Vec<u32>>> {
+        Ok(None)
+    }
+
     /// The same renderer where it has a backward pass of its own that is worth its device.
     fn differentiable(self: Arc<Self>) -> Option<Arc<dyn DifferentiableRenderer>> {
         None

@@ -114,6 +114,16 @@ impl Renderer for WithCpu {
         self.gpu.prepare(gaussians)
     }
 
+    fn near(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        at: [f64; 2],
+        by: f64,
+    ) -> Result<Option<Vec<u32>>> {
+        self.cpu.near(gaussians, request, at, by)
+    }
+
     fn differentiable(self: Arc<Self>) -> Option<Arc<dyn DifferentiableRenderer>> {
         if self.gpu.adapter().software { None } else { Some(self) }
     }

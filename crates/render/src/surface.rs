@@ -9,7 +9,10 @@ use rayon::prelude::*;
 use segsplat_core::scene::{biweight, least_squares};
 
 use super::{RenderRequest, oracle};
-use crate::{error::Result, scene::Gaussians};
+use crate::{
+    error::Result,
+    scene::{Gaussians, Intrinsics},
+};
 
 /// How far around the pixel the centres count, as a share of the picture's longer side: at this
 /// distance 1/√e of what they do at the pixel, at twice as much nothing.
@@ -32,8 +35,13 @@ struct Near {
     weight: f64,
 }
 
+/// How far around a pixel of a lens a surface is looked for, pixels.
+pub fn reach(lens: &Intrinsics) -> f64 {
+    2.0 * REACH * f64::from(lens.width.max(lens.height))
+}
+
 /// Depth at a place of the whole picture where the view blends `blended`; `None` where too few
-/// Gaussians tell.
+/// Gaussians tell. `among` are those that are asked, ascending, or all: those within [`reach`].
 ///
 /// # Errors
 /// `invalid_request` when the intrinsics are unusable.
@@ -42,9 +50,10 @@ pub fn depth(
     request: &RenderRequest,
     at: DVec2,
     blended: f64,
+    among: Option<&[u32]>,
 ) -> Result<Option<f64>> {
     let lens = request.camera.intrinsics.validated("camera")?;
-    let reach = REACH * f64::from(lens.width.max(lens.height));
+    let reach = 0.5 * reach(&lens);
     let (viewmat, origin) = (request.camera.camera_to_world.viewmat(), gaussians.origin());
     let near = |i: usize| {
         let mean = DVec3::from(gaussians.means()[i].map(f64::from)) + origin;
@@ -60,7 +69,7 @@ pub fn depth(
         let weight = opacity * (-0.5 * from.length_squared()).exp();
         Some(Near { from, inverse: blended / seen.z, weight })
     };
-    let near: Vec<Near> = (0..gaussians.len()).into_par_iter().filter_map(near).collect();
+    let near: Vec<Near> = oracle::numbers(gaussians, among).filter_map(near).collect();
     Ok(fitted(&near).map(|inverse| blended / inverse))
 }
 
@@ -124,7 +133,7 @@ mod tests {
     }
 
     fn blended((gaussians, request): &(Gaussians, RenderRequest), pixel: [u32; 2]) -> f64 {
-        let found = contributions(gaussians, request, pixel).unwrap();
+        let found = contributions(gaussians, request, pixel, None).unwrap();
         let all: f64 = found.iter().map(|one| one.weight).sum();
         found.iter().map(|one| one.weight * one.depth).sum::<f64>() / all
     }
@@ -132,7 +141,7 @@ mod tests {
     fn found(scene: &(Gaussians, RenderRequest), pixel: [u32; 2]) -> [f64; 2] {
         let [u, v] = pixel.map(|at| f64::from(at) + 0.5);
         let (blended, right) = (blended(scene, pixel), true_depth(v));
-        let depth = depth(&scene.0, &scene.1, DVec2::new(u, v), blended).unwrap();
+        let depth = depth(&scene.0, &scene.1, DVec2::new(u, v), blended, None).unwrap();
         [blended / right - 1.0, depth.unwrap() / right - 1.0]
     }
 
@@ -163,7 +172,7 @@ mod tests {
         let at = DVec2::new(80.5, 90.5);
         // Four of the 50 that are near.
         let few = all.only(|i| i % 11 == 0);
-        assert_eq!(depth(&few, &request, at, true_depth(90.5)).unwrap(), None);
-        assert_eq!(depth(&all, &request, at, 9.0).unwrap(), None, "nothing is there");
+        assert_eq!(depth(&few, &request, at, true_depth(90.5), None).unwrap(), None);
+        assert_eq!(depth(&all, &request, at, 9.0, None).unwrap(), None, "nothing is there");
     }
 }

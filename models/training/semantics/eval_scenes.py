@@ -93,15 +93,15 @@ class Caster:
     def _p(a):
         return a.ctypes.data_as(ctypes.c_void_p)
 
-    def render(self, insts, light, cam, width, height, threads):
+    def render(self, insts, light, cam, width, height, threads, colour=True):
         insts = np.ascontiguousarray(insts, np.float32)
         light = np.ascontiguousarray(light, np.float32)
         cam = np.ascontiguousarray(cam, np.float32)
-        rgb = np.zeros((height, width, 3), np.uint8)
+        rgb = np.zeros((height, width, 3), np.uint8) if colour else None
         depth = np.zeros((height, width), np.float32)
         ids = np.zeros((height, width), np.int32)
         self.lib.render(self.world, self._p(insts), len(insts), self._p(light), self._p(self.bank), TEX, LEVELS,
-                        self._p(cam), width, height, threads, self._p(rgb), self._p(depth), self._p(ids))
+                        self._p(cam), width, height, threads, self._p(rgb) if colour else None, self._p(depth), self._p(ids))
         return rgb, depth, ids
 
 

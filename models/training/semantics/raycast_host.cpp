@@ -77,7 +77,7 @@ void* world_new(const float* rows, const long long* ranges, int meshes) {
 void world_free(void* w) { delete (World*)w; }
 
 // insts: count rows of 27 floats (inv 12, mesh, tex 6, tint 3, show, repeat, spec, casts, light size).
-// light: l1 3, l2 3, c1 3, c2 3, amb. cam: camera_to_world 3x4 then fx fy cx cy.
+// light: l1 3, l2 3, c1 3, c2 3, amb. cam: camera_to_world 3x4 then fx fy cx cy. No rgb: no colour.
 void render(void* world, const float* in, int count, const float* light, const uint8_t* bank_data,
             int tex_size, int levels, const float* cam, int width, int height, int threads,
             uint8_t* rgb, float* depth, int32_t* ids) {
@@ -110,7 +110,7 @@ void render(void* world, const float* in, int count, const float* light, const u
       V3 o = v3(cam[3], cam[7], cam[11]), acc = v3(0, 0, 0);
       float fx = cam[12], fy = cam[13], cx = cam[14], cy = cam[15];
       long long at = (long long)y * width + x;
-      for (int k = 0; k < 5; ++k) {
+      for (int k = rgb ? 0 : 4; k < 5; ++k) {
         float sx = k == 4 ? 0.5f : (k & 1) * 0.5f + 0.25f, sy = k == 4 ? 0.5f : (k >> 1) * 0.5f + 0.25f;
         float dx = (x + sx - cx) / fx, dy = (y + sy - cy) / fy;
         float norm = sqrtf(dx * dx + dy * dy + 1.0f), iz = 1.0f / norm;
@@ -135,7 +135,7 @@ void render(void* world, const float* in, int count, const float* light, const u
         acc = acc + c * 0.25f;
       }
       float v[3] = {acc.x, acc.y, acc.z};
-      for (int c = 0; c < 3; ++c) {
+      for (int c = 0; rgb && c < 3; ++c) {
         rgb[at * 3 + c] = (uint8_t)(fminf(fmaxf(v[c], 0.0f), 1.0f) * 255.0f + 0.5f);
       }
     }

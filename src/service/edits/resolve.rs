@@ -144,7 +144,7 @@ fn of_text(
 /// The thing at a pixel of a view of the scene as it is now.
 fn of_pick(now: &Scene, asked: &PickSpec, limits: &Limits) -> Result<Selected> {
     let view = pick::pick_view(limits, now, asked)?;
-    let picked = pick::pick(now, &view, [asked.x, asked.y])?;
+    let picked = pick::pick(None, now, &view, [asked.x, asked.y])?;
     let (Some(number), Some(entry)) = (picked.gaussian, picked.entry) else {
         return Err(Error::invalid("nothing with a label is at this pixel"));
     };

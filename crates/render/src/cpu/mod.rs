@@ -332,6 +332,18 @@ impl Renderer for CpuRenderer {
         Ok(())
     }
 
+    fn near(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        at: [f64; 2],
+        by: f64,
+    ) -> Result<Option<Vec<u32>>> {
+        let frustum = Frustum::around(&View::new(gaussians.origin(), request)?, request, at, by);
+        let blocks = self.threads.install(|| self.blocks.get(gaussians, false))?;
+        Ok(blocks.map(|blocks| blocks.near(&frustum)))
+    }
+
     fn device_times(
         &self,
         gaussians: &Gaussians,

@@ -112,7 +112,7 @@ pub(crate) fn losses(
     let seen = oracle::render(gaussians, request).expect("the truth");
     let of_pixel = |(i, pixel): (usize, &oracle::OraclePixel)| {
         let at = [i as u32 % width, i as u32 / width];
-        let who = oracle::contributions(gaussians, request, at).expect("contributions");
+        let who = oracle::contributions(gaussians, request, at, None).expect("contributions");
         let color = loss.color.as_ref().unwrap()[i];
         let sum: f64 = (0..3).map(|k| f64::from(color[k]) * pixel.color[k]).sum();
         let depth = f64::from(loss.depth.as_ref().unwrap()[i]) * pixel.depth;

@@ -17,6 +17,7 @@ use segsplat_render::{
         project::{Projected, project},
     },
     oracle::{self, Contribution, Splat},
+    surface,
     view::View,
 };
 use segsplat_testing::{
@@ -216,6 +217,53 @@ fn pictures_of_a_gpu_with_blocks_have_the_same_bits() {
     }
 }
 
+/// Who asks for the surface at a pixel finds what all Gaussians say, of those of a few blocks.
+#[test]
+fn a_pixel_and_its_surface_need_a_few_blocks_alone() {
+    let (mut pixels, mut surfaces, mut asked, mut there) = (0, 0, 0, 0);
+    for seed in 0..12 {
+        let mut random = Random(seed);
+        // Small ones of a surface, which hardly reach a pixel beside them; or any, everywhere.
+        let (gaussians, request) = if seed % 2 == 0 {
+            let (gaussians, camera) = two_views(256, seed);
+            let mut raw = gaussians.into_raw();
+            raw.scales.as_flattened_mut().iter_mut().for_each(|scale| *scale *= 0.1);
+            (checked(raw), request(camera))
+        } else {
+            let request = RenderRequest { crop: None, ..any_request(&mut random) };
+            (scattered(30 * BLOCK, seed), request)
+        };
+        let lens = request.camera.intrinsics;
+        let view = View::new(gaussians.origin(), &request).expect("a view");
+        let blocks = Blocks::of(&gaussians);
+        for _ in 0..10 {
+            let pixel =
+                [lens.width, lens.height].map(|side| (random.bits() % u64::from(side)) as u32);
+            let at = pixel.map(|at| f64::from(at) + 0.5);
+            let near = blocks.near(&Frustum::around(&view, &request, at, surface::reach(&lens)));
+            let [all, few] = [None, Some(&near[..])].map(|among| {
+                let found = oracle::contributions(&gaussians, &request, pixel, among);
+                let found: Vec<_> = found
+                    .expect("a pixel")
+                    .iter()
+                    .map(|one| (one.gaussian, one.depth, one.weight))
+                    .collect();
+                let depth = |&(_, depth, _): &(usize, f64, f64)| {
+                    surface::depth(&gaussians, &request, at.into(), depth, among).expect("a pixel")
+                };
+                let depth = found.first().and_then(depth);
+                (found, depth)
+            });
+            assert_eq!(few, all, "seed {seed}, {pixel:?}");
+            surfaces += usize::from(all.1.is_some());
+            (pixels, asked) = (pixels + usize::from(!all.0.is_empty()), asked + near.len());
+            there += gaussians.len();
+        }
+    }
+    assert!(pixels > 50 && surfaces > 30, "{pixels} pixels, {surfaces} surfaces");
+    assert!(2 * asked < there, "{asked} of {there}");
+}
+
 /// Who asks for one pixel need not project every Gaussian, and finds what all of them give.
 #[test]
 fn what_adds_to_a_pixel_is_found_without_projecting_all() {
@@ -243,7 +291,7 @@ fn what_adds_to_a_pixel_is_found_without_projecting_all() {
                 }
                 wanted.push(Contribution { gaussian: *gaussian, depth: splat.depth, weight });
             }
-            let found = oracle::contributions(&gaussians, &request, pixel).expect("a pixel");
+            let found = oracle::contributions(&gaussians, &request, pixel, None).expect("a pixel");
             assert_eq!(found.len(), wanted.len(), "seed {seed}, {pixel:?}");
             for (found, wanted) in found.iter().zip(&wanted) {
                 assert_eq!((found.gaussian, found.depth), (wanted.gaussian, wanted.depth));

@@ -177,7 +177,7 @@ fn weights_of_a_word_are_those_of_the_oracle() {
         let request = RenderRequest::plain(camera, Kinds::COLOR, 0.1);
         for (pixel, score) in (0..400).zip(&map.index) {
             let [x, y] = [pixel % 20, pixel / 20];
-            for of in contributions(&gaussians, &request, [x, y]).unwrap() {
+            for of in contributions(&gaussians, &request, [x, y], None).unwrap() {
                 let sum = &mut sums[of.gaussian];
                 sum[0] += of.weight;
                 sum[1] += f64::from(u8::from(*score > 0)) * of.weight;
