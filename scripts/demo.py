@@ -31,7 +31,7 @@ from form import form
 # Real scenes: name, frames to post (by position in transforms.json).
 REAL = [("fox", [0, 1, 2, 3]), ("red_kitchen", [0, 1]), ("sceaux_castle", [4, 5, 6])]
 # What each scene is asked for.
-TEXTS = {"sample": ["carpet", "ball"], "fox": ["fox"], "red_kitchen": ["cup"],
+TEXTS = {"sample": ["box", "ball"], "fox": ["fox"], "red_kitchen": ["cup"],
          "sceaux_castle": ["castle"]}
 # Colour of what a text selects, and the share of it in the pixel.
 TINT, SHARE = (255, 110, 30), 0.55

@@ -148,13 +148,13 @@ def over_http(walk: Walk) -> None:
     assert size_of(photos / "part.png") == (64, 64)
     answers = list(objects_in(said))
     [found] = [one for one in answers if "results" in one]
-    assert [one["text"] for one in found["results"]] == ["carpet", "ball"]
+    assert [one["text"] for one in found["results"]] == ["box", "ball"]
     assert all(one["gaussians"] > 0 for one in found["results"]), found
     masks = json.loads((photos / "masks.json").read_text())
     assert all(one["view"]["mask_rle"]["counts"] for one in masks["results"])
     assert any(one.get("state") == "done" for one in answers), "the file of Gaussians"
     assert "event: done" in said
-    for name in ["carpet.ply", "scene.spz", "scene.colmap.zip", "openapi.json", "d.npy"]:
+    for name in ["box.ply", "scene.spz", "scene.colmap.zip", "openapi.json", "d.npy"]:
         assert (photos / name).stat().st_size > 1000, name
 
 
