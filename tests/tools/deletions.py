@@ -12,12 +12,12 @@ the PSNR of all other pixels against the view before, of all and of those 3 pixe
 from __future__ import annotations
 
 import json
-import shutil
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
+from captures import capture
 from PIL import Image
 
 import segsplat
@@ -45,14 +45,8 @@ def made(
     told = json.loads((folder / "transforms.json").read_text())
     frames = told["frames"][: 3 * PHOTOS : 3]
     with tempfile.TemporaryDirectory() as scratch:
-        to = Path(scratch)
-        (to / "images").mkdir()
-        for frame in frames:
-            name = Path(frame["file_path"]).name
-            shutil.copy(folder / "images" / name, to / "images")
-            frame["file_path"] = f"images/{name}"
-        (to / "transforms.json").write_text(json.dumps({**told, "frames": frames}))
-        scene = client.scene(to, semantics=semantics, progress=False)
+        part = capture(folder, told, frames, Path(scratch))
+        scene = client.scene(part, semantics=semantics, progress=False)
     return scene, [Path(frame["file_path"]).name for frame in frames]
 
 

@@ -17,11 +17,11 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import shutil
 import tempfile
 from pathlib import Path
 
 import numpy as np
+from captures import capture
 from PIL import Image
 from rooms import Rooms, places, seen_by
 
@@ -41,17 +41,13 @@ def made(
     every = len(told["frames"]) // photos
     frames = told["frames"][: every * photos : every]
     sent = []
+    for frame in frames:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] /= UNIT
+        sent.append({**frame, "transform_matrix": pose.tolist()})
     with tempfile.TemporaryDirectory() as scratch:
-        to = Path(scratch)
-        (to / "images").mkdir()
-        for frame in frames:
-            name = Path(frame["file_path"]).name
-            shutil.copy(folder / "images" / name, to / "images")
-            pose = np.array(frame["transform_matrix"])
-            pose[:3, 3] /= UNIT
-            sent.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
-        (to / "transforms.json").write_text(json.dumps({**told, "frames": sent}))
-        scene = client.scene(to, semantics="off", progress=False)
+        part = capture(folder, told, sent, Path(scratch))
+        scene = client.scene(part, semantics="off", progress=False)
     if refine:
         scene.refine(refine)
         list(scene.events())

@@ -15,12 +15,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
+from captures import capture
 from PIL import Image
 
 import segsplat
@@ -30,16 +30,6 @@ HELD_OUT = 6
 
 def spread(many: int, few: int) -> list[int]:
     return [int((i + 0.5) * many / few) for i in range(few)]
-
-
-def capture(folder: Path, told: dict, frames: list[dict], to: Path) -> Path:
-    """A folder of some frames."""
-    (to / "images").mkdir(parents=True)
-    for frame in frames:
-        shutil.copy(folder / frame["file_path"], to / "images")
-    sent = [{**one, "file_path": f"images/{Path(one['file_path']).name}"} for one in frames]
-    (to / "transforms.json").write_text(json.dumps({**told, "frames": sent}))
-    return to
 
 
 def straightened(photo: np.ndarray, lens: dict) -> tuple[np.ndarray, np.ndarray]:

@@ -12,10 +12,11 @@ from __future__ import annotations
 import argparse
 import json
 import random
-import shutil
 import string
 import tempfile
 from pathlib import Path
+
+from captures import capture
 
 import segsplat
 
@@ -38,14 +39,8 @@ def made(client: segsplat.Client, folder: Path) -> segsplat.Scene:
     told = json.loads((folder / "transforms.json").read_text())
     frames = told["frames"][:: -(-len(told["frames"]) // PHOTOS)]
     with tempfile.TemporaryDirectory() as scratch:
-        to = Path(scratch)
-        (to / "images").mkdir()
-        for frame in frames:
-            name = Path(frame["file_path"]).name
-            shutil.copy(folder / frame["file_path"], to / "images" / name)
-            frame["file_path"] = f"images/{name}"
-        (to / "transforms.json").write_text(json.dumps({**told, "frames": frames}))
-        return client.scene(to, semantics="eager", progress=False)
+        part = capture(folder, told, frames, Path(scratch))
+        return client.scene(part, semantics="eager", progress=False)
 
 
 def found(scene: segsplat.Scene, texts: list[str]) -> list[str]:
