@@ -107,7 +107,10 @@ fn engine() -> Option<Pipeline> {
     opened(Pipeline::open(&config.networks()))
 }
 
-/// The networks of a bundle, and how often they ran.
+/// Longer than it takes until photos that no job needs go from memory, where they stay no time.
+const SLOW: Duration = Duration::from_millis(1_500);
+
+/// The networks of a bundle, which are slow, and how often they ran.
 struct Counted(PipelineNetworks, AtomicUsize);
 
 impl SceneNetworks for Counted {
@@ -128,6 +131,7 @@ impl SceneNetworks for Counted {
         watch: Watch<'_>,
     ) -> Result<(Reconstruction, Option<Seen>)> {
         self.1.fetch_add(1, Ordering::AcqRel);
+        std::thread::sleep(SLOW);
         self.0.make_keeping(photos, options, watch)
     }
 
@@ -152,6 +156,7 @@ async fn the_networks_run_once_for_a_scene_and_its_refinement_and_again_after_a_
     let server = TestServer::with(|config, parts| {
         parts.scenes = given;
         config.limits.refine_steps_max = 8;
+        config.limits.first_text_photos_ms = 0;
     });
     let server = server.await;
     let refined = async |server: &TestServer, id: &SceneId| {
