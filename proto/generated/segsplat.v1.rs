@@ -1391,7 +1391,8 @@ pub struct MeasureRequest {
     /// Id.
     #[prost(string, tag = "1")]
     pub scene_id: ::prost::alloc::string::String,
-    /// 1 to 64 points of the world, in the order in which they are joined: x, y, z of each.
+    /// Points of the world, in the order in which they are joined: x, y, z of each. One at least, and
+    /// at most parts_max of the configuration (64 by default).
     #[prost(double, repeated, tag = "2")]
     pub points: ::prost::alloc::vec::Vec<f64>,
 }

@@ -147,8 +147,25 @@ fn whole<T>(path: &Path, write: impl FnOnce(&mut File) -> Result<T>) -> Result<(
     let unwritable = |e| scene_file::unwritable(path, e);
     let part = path.with_added_extension("part");
     let mut file = File::create(&part).map_err(unwritable)?;
-    let written = write(&mut file).inspect_err(|_| drop(fs_err::remove_file(&part)))?;
-    let size_bytes = file.metadata().map_err(unwritable)?.len();
-    fs_err::rename(&part, path).map_err(unwritable)?;
-    Ok((written, size_bytes))
+    let done = write(&mut file).and_then(|written| {
+        let size_bytes = file.metadata().map_err(unwritable)?.len();
+        fs_err::rename(&part, path).map_err(unwritable)?;
+        Ok((written, size_bytes))
+    });
+    done.inspect_err(|_| drop(fs_err::remove_file(&part)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_is_left_of_a_zip_that_cannot_take_its_place() {
+        let dir = tempfile::tempdir().unwrap();
+        let to = dir.path().join("folder");
+        fs_err::create_dir_all(to.join("full")).unwrap();
+        assert!(whole(&to, |_| Ok(())).is_err(), "a folder is there");
+        let names: Vec<_> = fs_err::read_dir(dir.path()).unwrap().flatten().collect();
+        assert_eq!(names.len(), 1, "{names:?}");
+    }
 }

@@ -158,14 +158,15 @@ impl SceneScale {
     }
 }
 
-/// A number of metres a unit that can be.
-fn checked(metres_per_unit: f64) -> Result<f64> {
+/// Metres a unit of the scene where `length` units are so many metres.
+fn per_unit(metres: f64, length: f64) -> Result<f64> {
     let [least, most] = METRES_PER_UNIT;
-    if (least..=most).contains(&metres_per_unit) {
-        return Ok(metres_per_unit);
+    let found = metres / length;
+    if (least..=most).contains(&found) {
+        return Ok(found);
     }
-    let bounds = format!("it must be {least} to {most}");
-    Err(Error::invalid(format!("a unit of the scene would be {metres_per_unit} metres; {bounds}")))
+    let found = format!("metres_per_unit is {found} ({metres} metres, {length} units)");
+    Err(Error::invalid(format!("{found}; it must be {least} to {most}")))
 }
 
 /// Refuses points that are nowhere.
@@ -248,7 +249,7 @@ impl Service {
                     Length::Of(length) => length,
                     Length::Thing(thing) => self.side_of(id, thing, wait).await?,
                 };
-                Some(checked(metres / length)?)
+                Some(per_unit(metres, length)?)
             }
         };
         let inner = Arc::clone(&self.inner);
@@ -312,7 +313,7 @@ impl OfflineService {
     ) -> Result<(SceneScale, Option<Measured>)> {
         let given = match spec.said()? {
             None => None,
-            Some((metres, Length::Of(length))) => Some(checked(metres / length)?),
+            Some((metres, Length::Of(length))) => Some(per_unit(metres, length)?),
             Some(_) => return Err(Error::invalid("a file is measured by points alone")),
         };
         let scale = SceneScale::of(scene, given);
@@ -379,7 +380,7 @@ mod tests {
             assert!(wrong.clone().said().is_err(), "{wrong:?}");
         }
         for wrong in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e7] {
-            assert!(checked(wrong).is_err(), "{wrong}");
+            assert!(per_unit(wrong, 1.0).is_err(), "{wrong}");
         }
     }
 }

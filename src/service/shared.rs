@@ -104,7 +104,7 @@ impl Shared {
     pub(super) fn place_to_watch(&self) -> Result<OwnedSemaphorePermit> {
         Arc::clone(&self.watchers).try_acquire_owned().map_err(|_| {
             let max = self.config.limits.watchers_max;
-            let why = format!("{max} callers are told edits already, the most that may be");
+            let why = format!("{max} callers are told edits already, the most that may");
             Error::new(ErrorCode::Overloaded, why).retry_after_s(WATCH_AGAIN_S)
         })
     }

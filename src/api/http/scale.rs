@@ -33,7 +33,8 @@ pub(super) struct ScaleBody {
 /// Points of a scene.
 #[derive(Debug, Default, Serialize, Deserialize, ToSchema)]
 pub(super) struct MeasureBody {
-    /// 1 to 64 points of the world, in the order in which they are joined.
+    /// Points of the world, in the order in which they are joined: one at least, and at most
+    /// `parts_max` of the configuration (64 by default).
     points: Vec<[f64; 3]>,
 }
 
