@@ -151,7 +151,7 @@ pub fn guessed(pipeline: &Pipeline, photos: &[UnposedPhoto]) -> Result<Vec<Optio
     }
     let network = pipeline.cameras()?;
     let photos: Vec<&Photo> = photos.iter().map(|unposed| &unposed.photo).collect();
-    pipeline.workers.install(|| network.find(&photos))
+    pipeline.on_workers(|| network.find(&photos))
 }
 
 /// What [`posed`] finds from these guesses, and whether it would refuse it.
@@ -191,7 +191,7 @@ pub fn mended(
         photos.iter().map(|posed| (&posed.photo, None)).collect();
     let (keypoints, matches) = matched(pipeline, &pixels, watch)?;
     let cameras: Vec<Camera> = photos.iter().map(|posed| posed.camera).collect();
-    pipeline.workers.install(|| mend(&cameras, &keypoints, &matches))
+    pipeline.on_workers(|| mend(&cameras, &keypoints, &matches))
 }
 
 /// The photos where their keypoints say that their cameras stand ([`mended`]), and what the
@@ -234,9 +234,9 @@ fn solved(
     };
     let grey =
         |(photo, _): &(&Photo, Option<f64>)| Grey::new(photo.width, photo.height, &photo.rgb);
-    let greys: Vec<Grey> = pipeline.workers.install(|| pixels.par_iter().map(grey).collect());
+    let greys: Vec<Grey> = pipeline.on_workers(|| pixels.par_iter().map(grey).collect());
     let share = |done: f64| tell(MATCHES_END + (SOLVED_END - MATCHES_END) * done as f32);
-    pipeline.workers.install(|| solve(&keypoints, &matches, &greys, &options, cancel, &share))
+    pipeline.on_workers(|| solve(&keypoints, &matches, &greys, &options, cancel, &share))
 }
 
 /// Keypoints of photos, each with its focal length where that is known, and their matches.
@@ -252,7 +252,7 @@ fn matched(
     for (done, (photo, _)) in photos.iter().enumerate() {
         unless_cancelled(cancel)?;
         tell(KEYPOINTS_END * fraction(done, photos.len()));
-        let found = pipeline.workers.install(|| network.find(photo))?;
+        let found = pipeline.on_workers(|| network.find(photo))?;
         descriptors.push(Descriptors::new(&found.descriptors, found.dim));
         seen.push(found);
     }
@@ -275,8 +275,7 @@ fn matched(
         Ok::<_, Error>(joined([i, j], &sure, &nearest))
     };
     let matches = pipeline
-        .workers
-        .install(|| pairs.par_iter().map(matched).collect::<Result<Vec<PairMatches>>>())?;
+        .on_workers(|| pairs.par_iter().map(matched).collect::<Result<Vec<PairMatches>>>())?;
     tell(MATCHES_END);
     let of_photo = |(found, (photo, focal)): (PhotoFeatures, &(&Photo, Option<f64>))| {
         let (size, keypoints) = ([photo.width, photo.height], found.keypoints);
@@ -349,7 +348,7 @@ fn confirmed(
         )));
     }
     let judge = || capture::analyse(&posed, watch.cancel);
-    let wrong = match pipeline.workers.install(judge) {
+    let wrong = match pipeline.on_workers(judge) {
         Ok(seen) => seen.warnings.into_iter().find(|warning| speaks_against(warning.code)),
         Err(e) if e.code() == ErrorCode::InvalidRequest => {
             return Err(refused(&format!("the photos do not confirm them: {}", e.message())));

@@ -137,7 +137,7 @@ fn see_more(
     let views = views_of(manifest, options, photos.len())?;
     let before = known.photos();
     let (capture, sets) = stages.run(Stage::Capture, || {
-        pipeline.workers.install(|| {
+        pipeline.on_workers(|| {
             let mut capture = capture::analyse_more(photos, &known.capture, watch.cancel)?;
             let new = capture.warnings.split_off(known.capture.warnings.len());
             capture.warnings = newest(&capture.warnings, &new);

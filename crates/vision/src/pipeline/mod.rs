@@ -157,6 +157,19 @@ impl Pipeline {
     pub fn workers(&self) -> &rayon::ThreadPool {
         &self.workers
     }
+
+    /// Does `work` on these threads; on those of the caller where it is one of a pool, such as that
+    /// of refinements on a processor, before which all else goes.
+    fn on_workers<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
+        on_pool(&self.workers, work)
+    }
+}
+
+fn on_pool<T: Send>(workers: &rayon::ThreadPool, work: impl FnOnce() -> T + Send) -> T {
+    match rayon::current_thread_index() {
+        Some(_) => work(),
+        None => workers.install(work),
+    }
 }
 
 /// What the stages make of photos. With an id and a provenance it is a [`Scene`].
@@ -365,7 +378,7 @@ fn see(
         )));
     }
     let (capture, sets) = stages.run(Stage::Capture, || {
-        pipeline.workers.install(|| {
+        pipeline.on_workers(|| {
             let capture = capture::analyse(photos, watch.cancel)?;
             let sets = capture::view_sets(&capture, photos, views, manifest.neighbors_max);
             Ok((capture, sets))
@@ -416,7 +429,7 @@ fn united(
             false => Backdrop::default(),
         };
         let lift = || lifted(pipeline, photos, views, &method, &fusion, watch);
-        let (lifted, backdrop) = pipeline.workers.install(|| rayon::join(lift, backdrop));
+        let (lifted, backdrop) = pipeline.on_workers(|| rayon::join(lift, backdrop));
         Ok((lifted?, backdrop))
     })?;
     let cameras = photos
@@ -464,7 +477,7 @@ fn lifted(
         Density::Full => None,
     };
     let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
-    pipeline.workers.install(|| {
+    pipeline.on_workers(|| {
         lift::lift(views, &cameras, method.prune, fusion, thinning.as_ref(), watch.cancel)
     })
 }
@@ -559,7 +572,15 @@ fn mean_best_overlap(capture: &Capture) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::views_max;
+    use super::{on_pool, views_max};
+
+    #[test]
+    fn a_caller_of_a_pool_keeps_its_threads() {
+        let pool = |threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let (workers, own) = (pool(3), pool(2));
+        let threads = || on_pool(&workers, rayon::current_num_threads);
+        assert_eq!([threads(), own.install(threads)], [3, 2]);
+    }
 
     #[test]
     fn views_at_once_are_a_wish_or_the_whole_scene_or_four() {

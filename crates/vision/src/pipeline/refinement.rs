@@ -45,6 +45,10 @@ const AWAKE_SIDE: u32 = 64;
 /// Longer side at which photos are learnt on a processor, and of smaller copies there, pixels.
 const PROCESSOR_SIDE: u32 = 640;
 const PROCESSOR_COARSE_SIDE: u32 = 240;
+/// Most Gaussians to begin with there, and a factor on all rates: its steps are few, so they are to
+/// be short and to go far (docs/adr/0115).
+const PROCESSOR_FIRST: usize = 100_000;
+const PROCESSOR_RATE: f32 = 1.6;
 /// About what a Gaussian of degree 0 takes on a device, with moments, gradients and tile pairs.
 const DEVICE_BYTES_A_GAUSSIAN: u64 = 600;
 
@@ -778,7 +782,13 @@ impl Parts<'_, '_> {
 fn fitted(options: &RefineOptions, photos: &[PosedPhoto], is_device: bool) -> RefineOptions {
     if !is_device {
         let side = options.side.min(PROCESSOR_SIDE);
-        return RefineOptions { side, coarse_side_min: PROCESSOR_COARSE_SIDE, ..*options };
+        return RefineOptions {
+            side,
+            coarse_side_min: PROCESSOR_COARSE_SIDE,
+            gaussians_first: options.gaussians_first.min(PROCESSOR_FIRST),
+            rate: options.rate * PROCESSOR_RATE,
+            ..*options
+        };
     }
     let half = options.device_bytes_max / 2;
     let pixels = |side: u32| -> f64 {
