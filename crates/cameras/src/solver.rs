@@ -35,6 +35,9 @@ const LINK_INLIERS_MIN: usize = 15;
 /// Rounds in which a solution gathers the matches that agree with it, while its score grows so.
 const FINISH_ROUNDS: usize = 4;
 const FINISH_GAIN: f64 = 1.01;
+/// How far a focal length may end from where its links were made, as a share, before these are made
+/// again with it.
+const LENS_OFF: f64 = 0.1;
 const KEPT_SHARE: f64 = 0.95;
 /// How far off the keypoints of a guess may be, turn by turn, in distances at which keypoints
 /// agree: the first is some three degrees.
@@ -123,6 +126,12 @@ fn is_more_than_chance(inliers: usize, log_chance: f64) -> bool {
     log_chance < LOG_CHANCE_MAX && inliers >= LINK_INLIERS_MIN
 }
 
+/// Whether all focal lengths are near those of other lenses.
+fn is_near(lenses: &[Lens], others: &[Lens]) -> bool {
+    let near = |(lens, other): (&Lens, &Lens)| (lens.focal / other.focal - 1.0).abs() < LENS_OFF;
+    lenses.iter().zip(others).all(near)
+}
+
 /// All candidates, the best first.
 ///
 /// # Errors
@@ -136,14 +145,24 @@ pub(crate) fn candidates(
     let first = survey.links(&known, usize::MAX, None);
     unless_cancelled(cancel)?;
     progress(0.4);
-    let mut all = Vec::new();
-    for lenses in lenses_to_try(survey, &known, &first) {
-        unless_cancelled(cancel)?;
-        progress(0.6);
-        let links = survey.links(&lenses, 60, Some(&first));
+    let grown_with = |lenses: &[Lens]| {
+        let links = survey.links(lenses, 60, Some(&first));
         let links: Vec<Link> = links.into_iter().flatten().filter(is_link).collect();
         let links = rotations::consistent(survey.views.len(), &links);
-        all.extend(grow_from_pairs(survey, &lenses, &links, cancel));
+        grow_from_pairs(survey, lenses, &links, cancel)
+    };
+    let (tried, mut all) = (lenses_to_try(survey, &known, &first), Vec::new());
+    for lenses in &tried {
+        unless_cancelled(cancel)?;
+        progress(0.6);
+        all.extend(grown_with(lenses));
+    }
+    // Links made with a focal length that is wrong contradict cameras that have the right one.
+    let best = all.iter().max_by(|a, b| a.score.total_cmp(&b.score));
+    let found = best.map(|best| best.grown.lenses.clone());
+    if let Some(found) = found.filter(|found| tried.iter().all(|lenses| !is_near(found, lenses))) {
+        unless_cancelled(cancel)?;
+        all.extend(grown_with(&found));
     }
     all.extend(survey.guess.as_ref().and_then(|guess| from_guess(survey, guess, &first, cancel)));
     all.sort_by(|a, b| b.score.total_cmp(&a.score));

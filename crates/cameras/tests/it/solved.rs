@@ -91,6 +91,23 @@ fn a_focal_length_of_exif_that_is_far_off_does_not_hold_the_cameras() {
 }
 
 #[test]
+fn photos_around_a_thing_are_all_placed_with_a_focal_length_that_is_half_as_long_again() {
+    for wrong in [0.3, 0.5, 0.6] {
+        let cameras = arc(12, 330.0, 4.0);
+        let plan = Plan { noise: 0.5, wrong, cameras, ..plan() };
+        let (mut photos, mut pairs) = photos(&plan);
+        photos.iter_mut().for_each(|photo| photo.focal = Some(1.5 * plan.focal));
+        // Others show another side.
+        for pair in pairs.iter_mut().filter(|pair| pair.photos[1] - pair.photos[0] > 2) {
+            pair.pairs.clear();
+        }
+        let off = off(&solved(&photos, &pairs).expect("a solution"), &plan);
+        assert_eq!(off.placed, 12, "{wrong}");
+        assert!((off.focal - 1.0).abs() < 0.03, "{wrong}: {}", off.focal);
+    }
+}
+
+#[test]
 fn a_photo_of_another_place_is_left_out_and_named() {
     let plan = Plan { noise: 0.5, wrong: 0.2, ..plan() };
     let (mut photos, mut pairs) = photos(&plan);
