@@ -303,7 +303,7 @@ impl Jobs {
         let scene = self.parts.store.put_grown(scene, semantics)?;
         let order = self.order_after(&record, &scene);
         // Jobs that come find the photos of the version that they see.
-        self.uploads.keep(id, upload);
+        self.uploads.leave(id, upload);
         if let Some(seen) = seen {
             self.uploads.keep_seen(id, seen);
         }

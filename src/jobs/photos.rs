@@ -173,10 +173,16 @@ impl ReadUploads {
         Self { bytes_max, left_for, uploads: Mutex::default() }
     }
 
-    /// Keeps an upload while jobs of its scene run or wait, where it fits: until it is renewed or
-    /// forgotten. Those that wait for a first text make room, the oldest first.
+    /// Keeps an upload until it is forgotten, where it fits. Those that wait for a first text make
+    /// room, the oldest first.
     pub(super) fn keep(&self, id: &SceneId, upload: Arc<ReadUpload>) {
         self.insert(id, Kept { upload, seen: None, labelled: None, until: None });
+    }
+
+    /// Keeps an upload for a first text, where it fits.
+    pub(super) fn leave(&self, id: &SceneId, upload: Arc<ReadUpload>) {
+        let until = Some(Instant::now() + self.left_for);
+        self.insert(id, Kept { upload, seen: None, labelled: None, until });
     }
 
     /// What the photos mean and what the networks said are kept only where they fit beside the
@@ -254,9 +260,11 @@ impl ReadUploads {
         self.uploads.lock().values().map(Kept::size_bytes).sum()
     }
 
-    /// Drops those whose time is over.
-    pub(super) fn forget_old(&self, now: Instant) {
-        self.uploads.lock().retain(|_, kept| kept.is_fresh(now));
+    /// Those whose time is over.
+    pub(super) fn old(&self, now: Instant) -> Vec<SceneId> {
+        let uploads = self.uploads.lock();
+        let old = uploads.iter().filter(|(_, kept)| !kept.is_fresh(now));
+        old.map(|(id, _)| id.clone()).collect()
     }
 }
 
@@ -281,27 +289,27 @@ mod tests {
         let uploads = ReadUploads::new(10, Duration::from_secs(60));
         let ids: Vec<SceneId> = (0..5).map(|byte| SceneId::from_bytes([byte; 16])).collect();
         let kept = || -> Vec<bool> { ids.iter().map(|id| uploads.find(id).is_some()).collect() };
-        let leave = |i: usize, bytes| {
-            uploads.keep(&ids[i], upload(bytes));
-            uploads.renew(&ids[i]);
+        let forget_old = |seconds| {
+            let old = uploads.old(Instant::now() + Duration::from_secs(seconds));
+            old.iter().for_each(|id| uploads.forget(id));
         };
-        leave(0, 4);
-        leave(1, 4);
+        uploads.leave(&ids[0], upload(4));
+        uploads.leave(&ids[1], upload(4));
         uploads.keep(&ids[2], upload(4));
         assert_eq!(kept(), [false, true, true, false, false], "the oldest makes room");
-        leave(3, 7);
+        uploads.leave(&ids[3], upload(7));
         assert_eq!(kept(), [false, true, true, false, false], "what cannot fit drops no other");
-        leave(3, 6);
+        uploads.leave(&ids[3], upload(6));
         assert_eq!(kept(), [false, false, true, true, false], "never one that a job needs");
         uploads.keep(&ids[4], upload(6));
         assert_eq!(kept(), [false, false, true, false, true]);
-        leave(4, 6);
-        uploads.forget_old(Instant::now() + Duration::from_secs(50));
+        uploads.leave(&ids[4], upload(6));
+        forget_old(50);
         assert_eq!(kept(), [false, false, true, false, true], "its time is not over");
-        uploads.forget_old(Instant::now() + Duration::from_secs(70));
+        forget_old(70);
         assert_eq!(kept(), [false, false, true, false, false], "a job's photos have no time");
         uploads.renew(&ids[2]);
-        uploads.forget_old(Instant::now() + Duration::from_secs(70));
+        forget_old(70);
         assert_eq!(kept(), [false; 5], "until no job waits for them");
     }
 }

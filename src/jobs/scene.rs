@@ -174,18 +174,18 @@ impl Jobs {
             // By a refinement, or by photos that join the scene.
             let is_needed =
                 self.parts.keep_photos || self.is_refined_next(record, photos.photos.len());
-            let semantics = record.options.semantics;
-            match semantics == SemanticsMode::Off && !is_needed {
-                true => self.uploads.forget(id),
-                false => self.uploads.keep(id, Arc::clone(&upload)),
-            }
-            // Photos may go from memory, and a job that reads them again has no cameras.
-            let is_given = photos.cameras.source == CamerasSource::Given;
-            if semantics == SemanticsMode::Eager
-                && is_given
-                && self.parts.semantics.begin_early(&record.options.method())
-            {
-                self.understand_early(id)?;
+            match record.options.semantics {
+                SemanticsMode::Eager => {
+                    self.uploads.keep(id, Arc::clone(&upload));
+                    // Photos may go from memory, and a job that reads them again has no cameras.
+                    let is_given = photos.cameras.source == CamerasSource::Given;
+                    if is_given && self.parts.semantics.begin_early(&record.options.method()) {
+                        self.understand_early(id)?;
+                    }
+                }
+                SemanticsMode::Lazy => self.uploads.leave(id, Arc::clone(&upload)),
+                SemanticsMode::Off if is_needed => self.uploads.leave(id, Arc::clone(&upload)),
+                SemanticsMode::Off => self.uploads.forget(id),
             }
             let made = match is_needed {
                 false => self.parts.scenes.make(photos, &record.options, watch)?,

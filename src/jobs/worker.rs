@@ -62,17 +62,24 @@ impl Jobs {
         self.queue.pop(kind)
     }
 
+    /// Whether a job of this scene runs, waits or follows.
+    fn is_at_work(&self, id: &SceneId) -> bool {
+        let record = self.records.find(id);
+        let has_next =
+            |record: &Record| !record.status.is_settled() || record.status.is_refined_now();
+        self.running.has(id) || record.is_some_and(|record| has_next(&record))
+    }
+
     /// Gives back what an ended job had, except where another of its scene runs, waits or may
     /// follow.
     fn leave(&self, job: &Job) {
         let id = &job.scene;
         self.go_on_growing(job);
-        if self.running.has(id) {
+        // What follows is queued already, by this job or by a caller.
+        if self.is_at_work(id) {
             return;
         }
         match self.records.find(id).as_ref().map(|record| &record.status) {
-            // What follows is queued already, by this job or by a caller.
-            Some(status) if !status.is_settled() || status.is_refined_now() => {}
             // Its first text, or photos that join it, need not read its photos.
             Some(status) if status.state == SceneState::Done && self.parts.keep_photos => {
                 self.uploads.renew(id);
@@ -178,7 +185,9 @@ impl Jobs {
         loop {
             let (limits, now) = (self.parts.limits.get(), Instant::now());
             let every = Duration::from_millis(limits.sweep_every_ms.max(1_000));
-            self.uploads.forget_old(now);
+            let old = self.uploads.old(now);
+            // A scene that takes long to make is refined with what the networks said of it.
+            old.iter().filter(|id| !self.is_at_work(id)).for_each(|id| self.uploads.forget(id));
             // What jobs freed, what was deleted, or left the caches.
             if self.freed.swap(false, Ordering::Relaxed) || now >= give_back {
                 give_back = now + GIVE_BACK_EVERY;
