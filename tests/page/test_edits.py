@@ -131,21 +131,6 @@ def test_holes_are_striped_where_the_server_says_and_nowhere_else(
     until(room, f"!{drawn}")
 
 
-def test_holes_are_asked_for_again_after_a_call_that_failed(room: Page) -> None:
-    room.locator("#view").click(position={"x": 640, "y": 400})
-    room.click("#act-delete")
-    edited(room, "Deleted: a clicked thing")
-    holes = room.locator("#holes")
-    room.route("**/view?*kind=holes*", lambda route: route.abort())
-    holes.click()
-    expect(room.locator("#says")).to_contain_text("cannot be reached")
-    room.unroute("**/view?*kind=holes*")
-    holes.click()
-    with room.expect_response(lambda answer: "kind=holes" in answer.url, timeout=30_000) as asked:
-        holes.click()
-    assert asked.value.ok, asked.value.text()
-
-
 def test_what_is_clicked_is_recoloured_and_deleted_by_a_key(
         room: Page, url: str, scene: str) -> None:
     room.locator("#view").click(position={"x": 640, "y": 400})
