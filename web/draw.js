@@ -9,17 +9,17 @@ const TINTS = [
   [0.85, 0.3, 0.85],
 ];
 
-// Each Gaussian on the picture, once a frame: centre, depth and opacity; the axes of its ellipse,
-// one standard deviation long.
+// Each Gaussian on the picture, once a frame: centre; the longer axis of its ellipse, one standard
+// deviation long, the length of the other one, and opacity.
 const PROJECT = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;
 uniform usampler2D packed; uniform sampler2D photos;
 uniform mat3 turn; uniform vec3 eye; uniform vec4 lens; uniform vec2 size;
 uniform float near, extent; uniform bool antialiased;
-layout(location = 0) out vec4 place; layout(location = 1) out vec4 axes;
+layout(location = 0) out vec4 place; layout(location = 1) out vec4 shape;
 float half15(uint q) { return (float(q & 0x7fffu) / 32767. - .5) * 1.41421356; }
 void main() {
-  place = axes = vec4(0.);
+  place = shape = vec4(0.);
   ivec2 cell = ivec2(gl_FragCoord.xy) * ivec2(2, 1);
   uvec4 a = texelFetch(packed, cell, 0), b = texelFetch(packed, cell + ivec2(1, 0), 0);
   vec3 mean = uintBitsToFloat(a.xyz), t = turn * (mean - eye);
@@ -61,39 +61,40 @@ void main() {
   vec3 area = cross(row0, row1);
   float sharp = dot(area, area), wides = xx + yy - 2. * blur;
   float small = (sharp + blur * (wides + blur)) / large;
-  axes = vec4(axis * sqrt(large), vec2(-axis.y, axis.x) * sqrt(small));
   // What the blur adds to small ones, taken off again.
   if (antialiased) opacity *= sqrt(sharp / (large * small));
   else if (seen < 1.) {
     float share = sqrt((sharp + learnt * (wides + learnt)) / (large * small));
     opacity -= (1. - share) * (opacity - 1. / 255.);
   }
-  place = vec4(f * t.xy + lens.zw, t.z / extent, opacity);
+  place.xy = f * t.xy + lens.zw;
+  vec2 sides = min(sqrt(vec2(large, small)), 6e4); // as halves hold
+  shape = vec4(axis * sides.x, sides.y, opacity);
 }`;
 
 // Four corners of a quad around the ellipse where alpha is 1/255.
 const QUADS = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;
-uniform usampler2D packed, order; uniform sampler2D places, axes, scores;
-uniform vec2 size;
+uniform usampler2D packed, order; uniform sampler2D places, shapes, scores;
+uniform vec2 size; uniform vec3 eye, ahead;
 out vec2 at; flat out vec4 tint; flat out vec4 score; flat out vec2 more;
 void main() {
   gl_Position = vec4(2., 2., 2., 1.);
   int quad = gl_VertexID / 6, k = gl_VertexID % 6;
   uint gaussian = texelFetch(order, ivec2(quad & 2047, quad >> 11), 0).x;
   ivec2 cell = ivec2(gaussian & 2047u, gaussian >> 11);
-  vec4 place = texelFetch(places, cell, 0);
-  if (place.w < 1. / 255.) return;
-  vec4 axis = texelFetch(axes, cell, 0);
+  vec4 shape = texelFetch(shapes, cell, 0);
+  if (shape.w < 1. / 255.) return;
   if (k > 2) k -= 2; // two triangles: 0 1 2 and 1 2 3
   vec2 corner = vec2(k & 1, k >> 1) * 2. - 1.;
-  at = corner * sqrt(2. * log(place.w * 255.) + 2e-4);
-  vec2 spot = place.xy + axis.xy * at.x + axis.zw * at.y;
+  at = corner * sqrt(2. * log(shape.w * 255.) + 2e-4);
+  vec2 across = normalize(vec2(-shape.y, shape.x)) * shape.z;
+  vec2 spot = texelFetch(places, cell, 0).xy + shape.xy * at.x + across * at.y;
   gl_Position = vec4(spot / size * vec2(2., -2.) + vec2(-1., 1.), 0., 1.);
-  uint rgb = texelFetch(packed, cell * ivec2(2, 1), 0).w;
-  tint = vec4(vec3(rgb & 255u, (rgb >> 8) & 255u, (rgb >> 16) & 255u) / 255., place.w);
+  uvec4 a = texelFetch(packed, cell * ivec2(2, 1), 0);
+  tint = vec4(vec3(uvec3(a.w) >> uvec3(0, 8, 16) & 255u) / 255., shape.w);
   score = vec4(0.);
-  more = vec2(place.z, 0.);
+  more = vec2(dot(ahead, uintBitsToFloat(a.xyz) - eye), 0.);
 #ifdef MORE
   int entry = int(texelFetch(packed, cell * ivec2(2, 1) + ivec2(1, 0), 0).w >> 16);
   score = texelFetch(scores, ivec2(entry & 255, entry >> 8), 0);
@@ -195,17 +196,15 @@ class Drawing {
     this.plain = this.program(QUADS, BLEND);
     this.full = this.program(more(QUADS), more(BLEND));
     this.show = this.program(WHOLE, SHOW);
-    this.order = this.texture();
     this.none = gl.createVertexArray();
     this.backdrop = this.texture();
     this.photos = this.texture();
     this.scores = this.texture();
     this.buffers = [0, 1, 2].map(() => this.texture());
     this.frame = gl.createFramebuffer();
-    this.projected = [0, 1].map(() => this.texture());
     this.spots = gl.createFramebuffer();
     this.size = [0, 0];
-    this.packed = null;
+    this.held = []; // textures of all Gaussians: packed, places, shapes, order
     this.empty();
   }
 
@@ -260,7 +259,7 @@ class Drawing {
     gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, gl.RGBA, type, data);
   }
 
-  // Makes room for that many Gaussians, 68 bytes each on the device: half as many as long as the
+  // Makes room for that many Gaussians, 52 bytes each on the device: half as many as long as the
   // device has no memory for them. The number that there is room for.
   room(count) {
     const gl = this.gl;
@@ -268,14 +267,12 @@ class Drawing {
     for (;;) {
       this.rows = Math.max(1, Math.ceil(count / ROW));
       while (![gl.NO_ERROR, gl.CONTEXT_LOST_WEBGL].includes(gl.getError()));
-      if (this.packed) gl.deleteTexture(this.packed);
-      this.packed = this.texture();
-      gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, 2 * ROW, this.rows);
-      for (const texture of this.projected)
-        this.fill(texture, gl.RGBA32F, ROW, this.rows, gl.FLOAT, null);
-      gl.bindTexture(gl.TEXTURE_2D, this.order);
-      const [form, kind] = [gl.RED_INTEGER, gl.UNSIGNED_INT];
-      gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, ROW, this.rows, 0, form, kind, null);
+      this.held.forEach((texture) => gl.deleteTexture(texture));
+      this.held = [gl.RGBA32UI, gl.RG32F, gl.RGBA16F, gl.R32UI].map((format, k) => {
+        const texture = this.texture();
+        gl.texStorage2D(gl.TEXTURE_2D, 1, format, k ? ROW : 2 * ROW, this.rows);
+        return texture;
+      });
       if (gl.getError() !== gl.OUT_OF_MEMORY) return count;
       if (count <= ROW) throw new Error(t('device.full'));
       count >>= 1;
@@ -287,10 +284,10 @@ class Drawing {
     const gl = this.gl;
     this.empty();
     this.header = header;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.spots);
     this.count = count = this.room(count);
     this.rest = new Uint32Array(0);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.spots);
-    this.projected.forEach((texture, k) => {
+    this.held.slice(1, 3).forEach((texture, k) => {
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + k, gl.TEXTURE_2D, texture, 0);
     });
     gl.drawBuffers([gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1]);
@@ -315,27 +312,15 @@ class Drawing {
   // More Gaussians; the last row of the texture may be filled twice.
   append(first, words) {
     const gl = this.gl,
-      from = Math.floor(first / ROW) * ROW;
-    const joined = new Uint32Array(this.rest.length + words.length);
-    joined.set(this.rest);
-    joined.set(words, this.rest.length);
-    const n = joined.length / 8,
+      n = (this.rest.length + words.length) / 8,
       rows = Math.ceil(n / ROW),
+      at = [0, Math.floor(first / ROW), 2 * ROW, rows],
       padded = new Uint32Array(8 * ROW * rows);
-    padded.set(joined);
-    gl.bindTexture(gl.TEXTURE_2D, this.packed);
-    gl.texSubImage2D(
-      gl.TEXTURE_2D,
-      0,
-      0,
-      from / ROW,
-      2 * ROW,
-      rows,
-      gl.RGBA_INTEGER,
-      gl.UNSIGNED_INT,
-      padded,
-    );
-    this.rest = joined.slice(8 * (n - (n % ROW)));
+    padded.set(this.rest);
+    padded.set(words, this.rest.length);
+    gl.bindTexture(gl.TEXTURE_2D, this.held[0]);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, ...at, gl.RGBA_INTEGER, gl.UNSIGNED_INT, padded);
+    this.rest = padded.slice(8 * (n - (n % ROW)), 8 * n);
     this.loaded = first + words.length / 8;
     this.worker.postMessage({ first, words }, [words.buffer]);
     this.asked = '';
@@ -383,10 +368,9 @@ class Drawing {
     if (number <= this.stale) return this.changed();
     this.sortMs = ms;
     this.sortKnown = known;
-    const rows = Math.max(1, Math.ceil(drawn / ROW));
-    gl.bindTexture(gl.TEXTURE_2D, this.order);
-    const [form, kind] = [gl.RED_INTEGER, gl.UNSIGNED_INT];
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, rows, form, kind, order);
+    const rows = order.length / ROW;
+    gl.bindTexture(gl.TEXTURE_2D, this.held[3]);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
     this.drawn = drawn;
     this.fresh = true;
     this.changed();
@@ -466,7 +450,7 @@ class Drawing {
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.spots);
     gl.viewport(0, 0, ROW, this.rows);
     gl.useProgram(this.project.program);
-    bind(this.packed, 0, project.packed);
+    bind(this.held[0], 0, project.packed);
     bind(this.photos, 1, project.photos);
     gl.uniformMatrix3fv(project.turn, false, turn);
     gl.uniform3fv(project.eye, eye);
@@ -485,12 +469,11 @@ class Drawing {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.useProgram(program);
-    bind(this.packed, 0, at.packed);
-    bind(this.projected[0], 1, at.places);
-    bind(this.projected[1], 2, at.axes);
-    bind(this.order, 4, at.order);
-    if (more) bind(this.scores, 3, at.scores);
+    ['packed', 'places', 'shapes', 'order'].forEach((name, k) => bind(this.held[k], k, at[name]));
+    if (more) bind(this.scores, 4, at.scores);
     gl.uniform2f(at.size, width, height);
+    gl.uniform3fv(at.eye, eye);
+    gl.uniform3fv(at.ahead, z.map((v) => v / header.unit));
     // Not instances: software draws each one by itself.
     gl.drawArrays(gl.TRIANGLES, 0, 6 * this.drawn);
     gl.bindFramebuffer(gl.FRAMEBUFFER, to.frame || null);
@@ -498,9 +481,7 @@ class Drawing {
     gl.disable(gl.BLEND);
     const show = this.show.at;
     gl.useProgram(this.show.program);
-    bind(this.buffers[0], 0, show.blended);
-    bind(this.buffers[1], 1, show.first);
-    bind(this.buffers[2], 2, show.second);
+    ['blended', 'first', 'second'].forEach((name, k) => bind(this.buffers[k], k, show[name]));
     bind(this.backdrop, 3, show.backdrop);
     gl.uniformMatrix3fv(show.turn, false, turn);
     gl.uniform4fv(show.lens, lens);
@@ -517,7 +498,6 @@ class Drawing {
     gl.uniform3fv(show.colors, TINTS.flat());
     gl.uniform3fv(show.fog, this.fog);
     gl.uniform1i(show.sky, header.backdrop ? 1 : 0);
-    gl.bindVertexArray(this.none);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     this.camera = camera;
   }

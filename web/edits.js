@@ -143,18 +143,14 @@ let focusOn = null; // the row to which the pressed one goes
 // Stripes over what edits uncovered and no photo saw, as the server says of the view at rest.
 const holes = { of: '', picture: null };
 async function seeHoles(width, height) {
-  const asked = new URLSearchParams({
-    kind: 'holes',
-    format: 'png',
-    camera_to_world: matrixOf(state.camera),
-    fx: focalOf(state.camera, height),
-    width,
-    height,
-  });
+  const asked = viewQuery(width, height, { kind: 'holes', format: 'png' });
   const of = `${state.scene.id}/view?${asked}#${edits.turn}`;
   if (of === holes.of) return;
   Object.assign(holes, { of, picture: null });
-  const answer = await server.call(`/v1/scenes/${of}`);
+  const answer = await server.call(`/v1/scenes/${of}`).catch((error) => {
+    if (of === holes.of) holes.of = '';
+    throw error;
+  });
   const seen = await createImageBitmap(await answer.blob()),
     picture = make('canvas', { width, height }),
     pen = picture.getContext('2d');

@@ -8,6 +8,16 @@ const told = (text) => {
   $('picked').textContent = text;
 };
 
+// What the server is asked of the view.
+const viewQuery = (width, height, more) =>
+  new URLSearchParams({
+    camera_to_world: matrixOf(state.camera),
+    fx: focalOf(state.camera, height),
+    width,
+    height,
+    ...more,
+  });
+
 async function clicked(event) {
   const box = $('view').getBoundingClientRect(),
     [width, height] = drawing.size;
@@ -23,14 +33,7 @@ async function clicked(event) {
     if (state.understood) await select(local, null, more);
     return;
   }
-  const query = new URLSearchParams({
-    camera_to_world: matrixOf(state.camera),
-    fx: focalOf(state.camera, height),
-    width,
-    height,
-    x,
-    y,
-  });
+  const query = viewQuery(width, height, { x, y });
   const names = state.understood && !state.measuring ? await namesOffered() : [];
   if (!state.measuring) told(t('looking'));
   const found = await namedAt(query, names);

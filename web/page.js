@@ -151,6 +151,19 @@ async function follow() {
   if (scene) await open(scene, camera, words);
 }
 
+async function startDrawing() {
+  drawing = new Drawing($('view'), invalidate, (gone) => {
+    $('view').dataset.state = 'busy';
+    if (gone) say(t('device.gone'));
+    else if (state.alone) own(state.camera).catch(failed);
+    else if (state.scene) load(state.scene.id, state.camera).catch(failed);
+  });
+  colour();
+  const changed = new MutationObserver(colour);
+  changed.observe(document.documentElement, { attributeFilter: ['data-theme'] });
+  matchMedia('(prefers-color-scheme: dark)').onchange = colour;
+}
+
 // The colour of the page, to which the scene fades; after a change of the theme too.
 function colour() {
   drawing.fog = getComputedStyle($('stage'))
@@ -164,21 +177,10 @@ async function begin() {
   translate();
   bind();
   for (const id of ['side', 'tools']) fold(id, innerWidth >= (id === 'side' ? 1200 : 721));
-  drawing = new Drawing($('view'), invalidate, (gone) => {
-    $('view').dataset.state = 'busy';
-    if (gone) say(t('device.gone'));
-    else if (state.alone) own(state.camera).catch(failed);
-    else if (state.scene) load(state.scene.id, state.camera).catch(failed);
-  });
-  colour();
-  new MutationObserver(colour).observe(document.documentElement, {
-    attributeFilter: ['data-theme'],
-  });
-  matchMedia('(prefers-color-scheme: dark)').onchange = colour;
   if (!$('packed')) {
     say(t('choose'));
-    const { embedded } = fromLink();
-    await Promise.all([embedded || list(), follow()]);
+    // The server answers while the device compiles.
+    await Promise.all([follow(), state.embedded || list(), startDrawing()]);
     return;
   }
   state.alone = true;
@@ -188,6 +190,7 @@ async function begin() {
   state.known = answer ? answer.results : [];
   state.floor = answer ? answer.scoring.coverage_floor : 0;
   $('known').append(...state.known.map(({ text }) => make('option', { value: text })));
+  await startDrawing();
   await own(link.camera);
   await follow();
   const words = link.words.length ? link.words : state.known.slice(0, 1).map((one) => one.text);

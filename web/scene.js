@@ -1,5 +1,6 @@
 // Reads a packed scene (crates/formats/src/packed.rs) as it comes, and sorts it in a worker.
 const RECORD = 32,
+  PART = 1 << 15, // records at a time: each time costs a copy
   // Most records: fewer where a finger points, on phones and tablets.
   MOST = matchMedia('(pointer: coarse)').matches ? 1 << 20 : 4 << 20,
   CELLS = [128, 64];
@@ -35,9 +36,10 @@ async function readPacked(stream, head, part) {
         kept = kept.slice(start);
       }
     }
-    // Parts of some size: each costs a copy to the worker.
+    // At first the coarsest form, where that is smaller.
     const whole = header ? Math.min(Math.floor(kept.length / RECORD), count - done) : 0;
-    if (whole > 0 && (end || done + whole === count || kept.length > 1 << 20)) {
+    const least = Math.min(PART, (!done && header?.coarse[0]?.gaussians) || PART);
+    if (whole > 0 && (end || done + whole === count || whole >= least)) {
       const bytes = kept.slice(0, whole * RECORD);
       part(done, new Uint32Array(bytes.buffer));
       done += whole;

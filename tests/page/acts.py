@@ -11,10 +11,17 @@ from pathlib import Path
 import numpy as np
 from form import form
 from PIL import Image
-from playwright.sync_api import Page
+from playwright.sync_api import Browser, Page
 
 # Software drawing on a busy machine: states are waited for, and this is the end of waiting.
 WAIT_MS = 300_000
+
+
+def window(browser: Browser, **options: object) -> Page:
+    """A page of its own, with the options of a browser's context, that waits as long as all do."""
+    context = browser.new_context(**options)  # type: ignore[arg-type]
+    context.set_default_timeout(WAIT_MS)
+    return context.new_page()
 
 
 def settled(page: Page) -> None:

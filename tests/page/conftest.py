@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from acts import WAIT_MS, post, sample
+from acts import WAIT_MS, post, sample, window
 from browser import opened_browser
 from playwright.sync_api import Browser, Page, expect
 from served import ROOT, run, served
@@ -72,13 +72,11 @@ def faults() -> list[str]:
 @pytest.fixture
 def page(browser: Browser, faults: list[str]) -> Iterator[Page]:
     """An empty page."""
-    context = browser.new_context(viewport={"width": 760, "height": 640}, accept_downloads=True,
-                                  reduced_motion="reduce")
-    context.set_default_timeout(WAIT_MS)
-    page = context.new_page()
+    page = window(browser, viewport={"width": 760, "height": 640}, accept_downloads=True,
+                  reduced_motion="reduce")
     page.on("pageerror", lambda error: faults.append(str(error)))
     page.on("console", lambda line: "Content Security Policy" in line.text
             and faults.append(line.text))
     yield page
-    context.close()
+    page.context.close()
     assert not faults, faults

@@ -11,7 +11,7 @@ import urllib.request
 
 import numpy as np
 import pytest
-from acts import WAIT_MS, Camera, pixels, settled, until
+from acts import Camera, pixels, settled, until, window
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 from test_panels import grave
@@ -131,6 +131,21 @@ def test_holes_are_striped_where_the_server_says_and_nowhere_else(
     until(room, f"!{drawn}")
 
 
+def test_holes_are_asked_for_again_after_a_call_that_failed(room: Page) -> None:
+    room.locator("#view").click(position={"x": 640, "y": 400})
+    room.click("#act-delete")
+    edited(room, "Deleted: a clicked thing")
+    holes = room.locator("#holes")
+    room.route("**/view?*kind=holes*", lambda route: route.abort())
+    holes.click()
+    expect(room.locator("#says")).to_contain_text("cannot be reached")
+    room.unroute("**/view?*kind=holes*")
+    holes.click()
+    with room.expect_response(lambda answer: "kind=holes" in answer.url, timeout=30_000) as asked:
+        holes.click()
+    assert asked.value.ok, asked.value.text()
+
+
 def test_what_is_clicked_is_recoloured_and_deleted_by_a_key(
         room: Page, url: str, scene: str) -> None:
     room.locator("#view").click(position={"x": 640, "y": 400})
@@ -242,8 +257,7 @@ def test_a_link_and_a_frame_show_the_edits_and_a_frame_offers_none(
     room.click("#act-delete")
     edited(room, "Deleted: ball")
     for more in ["", "&embed=1"]:
-        context = browser.new_context(viewport={"width": 1280, "height": 800})
-        other = context.new_page()
+        other = window(browser, viewport={"width": 1280, "height": 800})
         other.goto(room.url + more)
         settled(other)
         until(other, f"segsplat.drawing.count === {all_of_it - n}")
@@ -254,7 +268,7 @@ def test_a_link_and_a_frame_show_the_edits_and_a_frame_offers_none(
         # The last that a click adds.
         expect(other.locator("#picked").get_by_text("Measure from here")).to_be_attached()
         expect(other.locator("#act")).to_be_visible(visible=not more)
-        context.close()
+        other.context.close()
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
@@ -275,10 +289,8 @@ def test_axe_finds_nothing_serious_in_what_edits_show(
 def test_on_a_phone_a_tap_chooses_and_a_tap_deletes(
         browser: Browser, url: str, scene: str) -> None:
     kept(url, scene, SHUT)
-    context = browser.new_context(viewport={"width": 390, "height": 780}, has_touch=True,
-                                  reduced_motion="reduce")
-    context.set_default_timeout(WAIT_MS)
-    page = context.new_page()
+    page = window(browser, viewport={"width": 390, "height": 780}, has_touch=True,
+                  reduced_motion="reduce")
     page.goto(f"{url}/#scene={scene}")
     settled(page)
     page.touchscreen.tap(195, 390)
@@ -291,5 +303,5 @@ def test_on_a_phone_a_tap_chooses_and_a_tap_deletes(
         assert box and box["height"] >= 36, button.inner_text()
     page.locator("#act-delete").tap()
     edited(page, "Deleted: a clicked thing")
-    context.close()
+    page.context.close()
     kept(url, scene, SHUT)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from acts import Camera, open_scenes, pixels, post, settled, until
+from acts import Camera, open_scenes, pixels, post, settled, until, window
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect
 from served import ROOT, served
@@ -95,12 +95,11 @@ def test_a_scene_has_a_name_which_its_link_carries(
     settled(page)
     expect(page.locator("#name")).to_have_value("My table")
     # Another browser knows it by the link.
-    context = browser.new_context(viewport={"width": 1280, "height": 800})
-    other = context.new_page()
+    other = window(browser, viewport={"width": 1280, "height": 800})
     other.goto(page.url)
     settled(other)
     expect(other.locator("#name")).to_have_value("My table")
-    context.close()
+    other.context.close()
     page.fill("#name", "")
     page.press("#name", "Enter")
     expect(row.locator(".name")).to_have_text("A file (ply)")
@@ -148,15 +147,14 @@ def test_a_true_length_makes_metres_which_a_link_carries(
     page.press("#picked input", "Enter")
     expect(page.locator("#picked")).to_contain_text("2.50 m between the two points.")
     page.click("#measure")
-    context = browser.new_context(viewport={"width": 760, "height": 640})
-    other = context.new_page()
+    other = window(browser, viewport={"width": 760, "height": 640})
     other.goto(page.url)
     settled(other)
     for one in [page, other]:
         one.locator("#view").click(position={"x": 250, "y": 330})
         expect(one.locator("#picked")).to_contain_text(re.compile(r"\d m from the camera"))
     expect(other.locator("#scale-says")).to_have_text(re.compile("by the length that was given"))
-    context.close()
+    other.context.close()
     # It is kept with the scene, and nothing said takes it back.
     say = ("(scale) => fetch(`/v1/scenes/${segsplat.state.scene.id}/scale`, scale)"
            ".then((answer) => answer.json())")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
+from acts import window
 from playwright.sync_api import Browser, Page, expect
 from served import ROOT
 
@@ -47,11 +48,10 @@ def test_each_word_is_used_and_each_used_word_is_there(table: dict[str, list[str
 def test_the_page_speaks_the_browsers_language(
         browser: Browser, url: str, table: dict[str, list[str]], locale: str, language: str,
         place: int) -> None:
-    context = browser.new_context(locale=locale)
-    page = context.new_page()
+    page = window(browser, locale=locale)
     page.goto(url)
     expect(page.locator("html")).to_have_attribute("lang", language)
     expect(page.locator("#sample")).to_have_text(table["sample"][place])
     expect(page.locator("#view")).to_have_attribute("aria-label", table["view"][place])
     expect(page.locator("#says")).to_have_text(table["choose"][place])
-    context.close()
+    page.context.close()

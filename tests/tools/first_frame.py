@@ -122,7 +122,7 @@ def main() -> None:
         rows = page.evaluate("segsplat.drawing.rows")
         processes = ", ".join(f"{kind} {most:.0f} MB" for kind, most in memory().items())
         print(f"settled after {took:.0f} s; {count} of {given.gaussians} have room; heap {heap:.0f}"
-              f" MB, textures {rows * 2048 * 68 / MB:.0f} MB; most resident memory of processes: "
+              f" MB, textures {rows * 2048 * 52 / MB:.0f} MB; most resident memory of processes: "
               f"{processes}", flush=True)
         # What comes in three seconds beside the page itself.
         length = int.from_bytes(packed[:4], "little")
