@@ -66,6 +66,8 @@ const OVERFIT_REFUSED: f64 = 6.0;
 
 /// The work on a version makes all that was done this many times as long.
 const LONGER: u32 = 4;
+/// Share of all that is left which a proof has, where those before it were not better.
+const LAST_PROOF_SHARE: f32 = 0.5;
 
 /// What a refinement came to.
 #[derive(Clone, Debug)]
@@ -159,6 +161,14 @@ pub fn refined(
     if held.is_empty() { parts.unwatched() } else { parts.watched(&held) }
 }
 
+/// What comes next: a proof, and a version where that is better.
+#[derive(Clone, Copy, Debug)]
+struct Part {
+    budget: RefineBudget,
+    /// Share of it that the proof has.
+    proof_share: f32,
+}
+
 /// Steps that were taken, and their time.
 #[derive(Clone, Copy, Debug, Default)]
 struct Work {
@@ -238,7 +248,7 @@ impl Parts<'_, '_> {
         let mut found = Refined { report, overfit: None, pose_gain: None, versions: 0 };
         let (mut first, mut whole) = (Some(first), None::<Whole>);
         while let Some(part) = self.next_part(whole.is_some()) {
-            let options = self.options_of(part, first.is_some());
+            let options = self.options_of(part.budget, first.is_some());
             let last = proof.judged.filter(|_| whole.is_some());
             let proven = self.prove(&mut proof, part, &options)?;
             if let Some(first) = first.take() {
@@ -266,7 +276,7 @@ impl Parts<'_, '_> {
             }
             let mut made = match whole.take() {
                 Some(whole) => whole,
-                None => self.begin_whole(&proof, overfits)?,
+                None => self.begin_whole(&proof, overfits && self.can_begin_anew(proven))?,
             };
             let budget = match overfits {
                 true => self.budget_of_overfit(),
@@ -288,11 +298,11 @@ impl Parts<'_, '_> {
     fn prove(
         &mut self,
         proof: &mut Proof<'_>,
-        part: RefineBudget,
+        part: Part,
         options: &RefineOptions,
     ) -> Result<Work> {
         let options = RefineOptions {
-            budget: of_budget(part, self.proof_share()),
+            budget: of_budget(part.budget, part.proof_share),
             gaussians_max: self.share_without(proof.held, options.gaussians_max),
             ..*options
         };
@@ -309,7 +319,7 @@ impl Parts<'_, '_> {
         &mut self,
         proof: &mut Proof<'_>,
         mut first: Gaussians,
-        part: RefineBudget,
+        part: Part,
         options: &RefineOptions,
     ) -> Result<Option<f64>> {
         let is_asked = self.options.pose_rate > 0.0;
@@ -595,34 +605,41 @@ impl Parts<'_, '_> {
     }
 
     /// The budget of the part that comes next; `None` where all is spent.
-    fn next_part(&self, is_published: bool) -> Option<RefineBudget> {
-        let left = self.left();
+    fn next_part(&self, is_published: bool) -> Option<Part> {
+        let (left, proof_share) = (self.left(), self.proof_share());
         if left.steps == 0 || left.time.is_zero() {
             return None;
         }
         if self.done.steps == 0 {
-            return Some(RefineBudget { steps: left.steps.min(self.options.first_steps), ..left });
+            let steps = left.steps.min(self.options.first_steps);
+            return Some(Part { budget: RefineBudget { steps, ..left }, proof_share });
         }
         // Where nothing was published yet, only proofs were made.
-        let proofs = if is_published { 1.0 } else { 1.0 / self.proof_share() };
+        let proofs = if is_published { 1.0 } else { 1.0 / proof_share };
         let longer = (LONGER - 1) as f32 * proofs;
+        let mut budget = left;
         // What would be left after it must be worth a part of its own.
-        Some(if self.is_timed() {
-            let time = self.done.time.mul_f32(longer);
-            RefineBudget { time: if left.time < time * 2 { left.time } else { time }, ..left }
+        let is_last = if self.is_timed() {
+            budget.time = self.done.time.mul_f32(longer);
+            left.time < budget.time * 2
         } else {
-            let steps = share_of(self.done.steps, longer);
-            RefineBudget { steps: if left.steps / 2 < steps { left.steps } else { steps }, ..left }
-        })
+            budget.steps = share_of(self.done.steps, longer);
+            left.steps / 2 < budget.steps
+        };
+        if !is_last {
+            return Some(Part { budget, proof_share });
+        }
+        let proof_share = if is_published { proof_share } else { LAST_PROOF_SHARE };
+        Some(Part { budget: left, proof_share })
     }
 
     /// What a part has left after its proof, which took so long; all that is left at all where not
     /// much more would come after it.
-    fn rest_of(&self, part: RefineBudget, proof: Duration) -> RefineBudget {
-        let (left, share) = (self.left(), 1.0 - self.proof_share());
-        let rest = of_budget(part, share);
+    fn rest_of(&self, part: Part, proof: Duration) -> RefineBudget {
+        let (left, share) = (self.left(), 1.0 - part.proof_share);
+        let rest = of_budget(part.budget, share);
         let is_last = if self.is_timed() {
-            left.time < proof.mul_f32(2.0 * share / self.proof_share())
+            left.time < proof.mul_f32(2.0 * share / part.proof_share)
         } else {
             left.steps / 2 < rest.steps
         };
@@ -633,8 +650,19 @@ impl Parts<'_, '_> {
     /// that suffices for them, for more lose (docs/adr/0108).
     fn budget_of_overfit(&self) -> RefineBudget {
         let left = self.left();
-        let steps = share_of(self.options.first_steps, 1.0 - self.proof_share()).max(1);
-        RefineBudget { steps: steps.min(left.steps), ..left }
+        RefineBudget { steps: self.steps_of_overfit().min(left.steps), ..left }
+    }
+
+    fn steps_of_overfit(&self) -> u32 {
+        share_of(self.options.first_steps, 1.0 - self.proof_share()).max(1)
+    }
+
+    /// Whether what is left suffices for these steps, at the pace of the proof. Fewer that begin
+    /// with the Gaussians of the networks come to less than what is served (docs/adr/0116).
+    fn can_begin_anew(&self, proven: Work) -> bool {
+        let (left, steps) = (self.left(), self.steps_of_overfit());
+        let time = proven.time.mul_f64(f64::from(steps) / f64::from(proven.steps.max(1)));
+        steps <= left.steps && time <= left.time
     }
 
     /// Whether time is what ends it.
@@ -719,13 +747,12 @@ impl Parts<'_, '_> {
         Ok(differs(&|i| i)? / differs(&|i| i - 1)?)
     }
 
-    /// The scene of all photos, before its first step; it goes on from a proof that does not
-    /// overfit.
-    fn begin_whole(&mut self, proof: &Proof<'_>, overfits: bool) -> Result<Whole> {
+    /// The scene of all photos, before its first step; it goes on from the proof, or begins `anew`.
+    fn begin_whole(&mut self, proof: &Proof<'_>, anew: bool) -> Result<Whole> {
         let (start, gaussians) = self.begin(&self.left_out.clone())?;
         let gaussians = self.with_cameras(gaussians)?;
         let begun = |gaussians| Whole { start, gaussians, steps: 0 };
-        if overfits {
+        if anew {
             return Ok(begun(gaussians));
         }
         let of_held = |i: usize| proof.held.contains(&usize::from(gaussians.source()[i].view));

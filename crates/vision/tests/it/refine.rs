@@ -14,7 +14,7 @@ use segsplat_core::{
     error::{Error, ErrorCode, Result},
     scene::{
         Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Photo, PosedPhoto, Provenance,
-        Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
+        RefineReport, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
     },
 };
 use segsplat_render::{
@@ -258,6 +258,17 @@ fn refined_whole(
     options: &RefineOptions,
     made: &dyn Fn(),
 ) -> Whole {
+    refined_again(renderer, photos, options, made, None)
+}
+
+/// The same of a scene whose last version was this good at its held-out photos, dB.
+fn refined_again(
+    renderer: &dyn DifferentiableRenderer,
+    photos: &[PosedPhoto],
+    options: &RefineOptions,
+    made: &dyn Fn(),
+    psnr_after: Option<f64>,
+) -> Whole {
     let start = disturbed(&cloud(400, 0, 5));
     let reconstruction = |photos: &[PosedPhoto]| {
         let mut raw = start.clone().into_raw();
@@ -277,7 +288,9 @@ fn refined_whole(
         }
     };
     let id = SceneId::from_bytes([1; 16]);
-    let scene = reconstruction(photos).into_scene(id, 0, Provenance::default());
+    let mut scene = reconstruction(photos).into_scene(id, 0, Provenance::default());
+    scene.meta.report.refinement =
+        psnr_after.map(|_| RefineReport { psnr_after, ..RefineReport::default() });
     let mut remake = |held: &[usize]| {
         made();
         let made = reconstruction(&split(photos, held).0);
@@ -334,6 +347,38 @@ fn a_first_version_comes_soon_and_others_only_where_they_gain() {
     assert!((sharp - soft - 0.4).abs() < 1e-9);
     let worse = refined(&RefineOptions { rate: -1.0, ..steps_of(640, 40) });
     assert!(worse.versions.is_empty() && worse.found.versions == 0, "steps that lead away");
+}
+
+/// The first proof, of 10 steps, is not better than what is served. 190 are left, too few for two
+/// parts more: a half is for the next proof, and the version goes on from it with the others.
+#[test]
+fn a_last_proof_has_half_of_what_is_left() {
+    let (_, photos) = captured(9);
+    let options = steps_of(200, 40);
+    let refined = |psnr_after: Option<f64>| {
+        refined_again(&cpu(), &photos, &options, &|| (), psnr_after)
+    };
+    let psnr = |whole: &Whole| whole.versions[0].1.report.psnr_after.expect("held-out photos");
+    let first = refined(None);
+    let (steps, after) = (first.versions[0].1.report.steps, psnr(&first));
+    let again = refined(Some(after + 0.1));
+    println!("{after:.2} dB after {steps} steps, {:.2} after the last proof", psnr(&again));
+    assert_eq!((steps, again.versions[0].1.report.steps, again.found.versions), (30, 95, 1));
+    assert!(psnr(&again) > after + 0.1);
+}
+
+/// Fewer steps than a version of an overfitting proof has do not bring it from the networks'
+/// Gaussians to where the proof is.
+#[test]
+fn a_version_without_the_steps_to_begin_anew_goes_on_from_the_proof() {
+    let (_, photos) = captured(9);
+    let means = |steps: u32, overfit_max: f32| {
+        let options = RefineOptions { overfit_max, ..steps_of(steps, 40) };
+        let whole = refined_whole(&cpu(), &photos, &options, &|| ());
+        whole.versions[0].1.gaussians.means().to_vec()
+    };
+    assert!(means(36, 0.0) == means(36, 100.0), "27 steps are left, 30 are a version");
+    assert!(means(40, 0.0) != means(40, 100.0), "it begins anew with 30");
 }
 
 #[test]
