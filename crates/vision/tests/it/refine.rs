@@ -355,9 +355,8 @@ fn a_first_version_comes_soon_and_others_only_where_they_gain() {
 fn a_last_proof_has_half_of_what_is_left() {
     let (_, photos) = captured(9);
     let options = steps_of(200, 40);
-    let refined = |psnr_after: Option<f64>| {
-        refined_again(&cpu(), &photos, &options, &|| (), psnr_after)
-    };
+    let refined =
+        |psnr_after: Option<f64>| refined_again(&cpu(), &photos, &options, &|| (), psnr_after);
     let psnr = |whole: &Whole| whole.versions[0].1.report.psnr_after.expect("held-out photos");
     let first = refined(None);
     let (steps, after) = (first.versions[0].1.report.steps, psnr(&first));
