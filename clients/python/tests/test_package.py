@@ -101,6 +101,8 @@ def test_the_server_keeps_to_its_schema(scene: Scene, url: str, tmp_path: Path) 
         Path(sys.executable).with_name("schemathesis"),
         *("run", f"{url}/openapi.json", "--exclude-method", "DELETE", "--seed", "1"),
         *("--phases", "coverage,fuzzing", "--max-examples", "10", "--checks", checks),
+        # As long as the deadline: the sample is made when it is first asked for.
+        *("--request-timeout", "60"),
         # Its own generator: forms with photos and two headers are hard to make up.
         "--suppress-health-check=filter_too_much",
         cwd=tmp_path,

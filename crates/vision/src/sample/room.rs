@@ -22,6 +22,8 @@ const ROOM: DVec3 = DVec3::new(2.7, 2.9, 5.2);
 const BACK_WALL: f64 = 2.0;
 /// Corners of the corridor: least and largest.
 const CORRIDOR: [DVec3; 2] = [DVec3::new(-1.1, -2.5, -1.5), DVec3::new(1.1, 0.0, 12.0)];
+/// Factor on the square of the radius of the ball around a thing, for rounding.
+const BALL_MARGIN: f64 = 1.0 + 1e-6;
 /// Paper behind the turntable, linear light.
 const PAPER: DVec3 = DVec3::new(0.36, 0.37, 0.39);
 
@@ -370,12 +372,15 @@ impl Room {
 
     fn nearest(&self, from: DVec3, ray: DVec3) -> Option<(usize, Hit)> {
         let things = self.things.iter().enumerate();
-        let hits = things.filter_map(|(i, thing)| Some((i, thing.hit(from, ray)?)));
+        let near = things.filter(|(_, thing)| thing.is_near(from, ray, f64::INFINITY));
+        let hits = near.filter_map(|(i, thing)| Some((i, thing.hit(from, ray)?)));
         hits.min_by(|a, b| a.1.t.total_cmp(&b.1.t))
     }
 
     fn blocked(&self, from: DVec3, to: DVec3) -> bool {
-        let solid = |thing: &&Thing| !matches!(thing.shape, Shape::Walls(..));
+        let solid = |thing: &&Thing| {
+            !matches!(thing.shape, Shape::Walls(..)) && thing.is_near(from, to, 1.0)
+        };
         self.things.iter().filter(solid).any(|t| t.hit(from, to).is_some_and(|h| h.t < 1.0))
     }
 }
@@ -389,6 +394,20 @@ impl Thing {
     fn to_world(self, v: DVec3) -> DVec3 {
         let (c, s) = (self.turn.x, self.turn.y);
         DVec3::new(c * v.x + s * v.z, v.y, c * v.z - s * v.x)
+    }
+
+    /// Whether a ray comes within the ball around a thing before `end`, in lengths of the ray: what
+    /// it does not come near it does not hit.
+    fn is_near(&self, from: DVec3, ray: DVec3, end: f64) -> bool {
+        let reach = match self.shape {
+            Shape::Block(half) => half.length_squared(),
+            Shape::Ball(radius) => radius * radius,
+            Shape::Pillar(radius, half) => radius * radius + half * half,
+            Shape::Walls(..) => return true,
+        };
+        let middle = self.at - from;
+        let nearest = (middle.dot(ray) / ray.length_squared()).clamp(0.0, end);
+        (middle - ray * nearest).length_squared() <= reach * BALL_MARGIN
     }
 
     fn hit(&self, from: DVec3, ray: DVec3) -> Option<Hit> {
