@@ -141,7 +141,7 @@ def test_holes_are_asked_for_again_after_a_call_that_failed(room: Page) -> None:
     expect(room.locator("#says")).to_contain_text("cannot be reached")
     room.unroute("**/view?*kind=holes*")
     holes.click()
-    with room.expect_response(lambda answer: "kind=holes" in answer.url, timeout=30_000) as asked:
+    with room.expect_response(lambda answer: "kind=holes" in answer.url) as asked:
         holes.click()
     assert asked.value.ok, asked.value.text()
 

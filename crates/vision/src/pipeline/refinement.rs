@@ -109,8 +109,9 @@ pub struct RefineCalls<'a> {
 /// The work is done in parts. The first has few steps, so that a better version is there soon, and
 /// each further one makes the work four times as long. A part begins with the proof: a scene
 /// without the held-out photos is refined in a share of the time
-/// ([`RefineOptions::proof_share`]). Where its PSNR on these photos rises over that of what is
-/// served, the scene of all photos is refined in the time of the part that is left, and published.
+/// ([`RefineOptions::proof_share`]; half of it where no proof was better yet and no other part
+/// follows, docs/adr/0116). Where its PSNR on these photos rises over that of what is served, the
+/// scene of all photos is refined in the time of the part that is left, and published.
 /// Where the proof of a further part gains less than [`RefineOptions::gain_min`] in PSNR and SSIM
 /// together ([`Judged::score`]), the work ends: so more time is never worse. It also ends where the
 /// proof overfits, for what its held-out photos gain then, other views lose: with the first
@@ -119,8 +120,8 @@ pub struct RefineCalls<'a> {
 ///
 /// The first scene of all photos goes on from the proof's Gaussians, and those of the held-out
 /// photos, where the proof explains these nearly as well as photos that it learnt
-/// ([`RefineOptions::overfit_max`]); else it begins with those of the networks (docs/adr/0041). Of
-/// too few photos none is held out, and few steps are taken.
+/// ([`RefineOptions::overfit_max`]); else it begins with those of the networks (docs/adr/0041),
+/// where there is time for its steps. Of too few photos none is held out, and few steps are taken.
 ///
 /// **Cameras.** The first proof also says whether cameras are wrong: where the held-out photos gain
 /// [`RefineOptions::mends_from`] by cameras that fit the scene of the others, cameras are learnt
@@ -604,7 +605,7 @@ impl Parts<'_, '_> {
         share
     }
 
-    /// The budget of the part that comes next; `None` where all is spent.
+    /// The part that comes next; `None` where all is spent.
     fn next_part(&self, is_published: bool) -> Option<Part> {
         let (left, proof_share) = (self.left(), self.proof_share());
         if left.steps == 0 || left.time.is_zero() {
