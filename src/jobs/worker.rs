@@ -65,8 +65,6 @@ impl Jobs {
     /// Whether a job of this scene runs, waits or follows.
     fn is_at_work(&self, id: &SceneId) -> bool {
         let record = self.records.find(id);
-        let has_next =
-            |record: &Record| !record.status.is_settled() || record.status.is_refined_now();
         self.running.has(id) || record.is_some_and(|record| has_next(&record))
     }
 
@@ -75,13 +73,13 @@ impl Jobs {
     fn leave(&self, job: &Job) {
         let id = &job.scene;
         self.go_on_growing(job);
-        // What follows is queued already, by this job or by a caller.
-        if self.is_at_work(id) {
-            return;
-        }
-        match self.records.find(id).as_ref().map(|record| &record.status) {
+        let record = self.records.find(id);
+        match record {
+            // What follows is queued already, by this job or by a caller.
+            _ if self.running.has(id) => (),
+            Some(record) if has_next(&record) => (),
             // Its first text, or photos that join it, need not read its photos.
-            Some(status) if status.state == SceneState::Done && self.parts.keep_photos => {
+            Some(record) if record.status.state == SceneState::Done && self.parts.keep_photos => {
                 self.uploads.renew(id);
                 self.replicas.release(id);
             }
@@ -212,6 +210,11 @@ impl Jobs {
             }
         }
     }
+}
+
+/// Whether a job of its scene waits or follows.
+fn has_next(record: &Record) -> bool {
+    !record.status.is_settled() || record.status.is_refined_now()
 }
 
 /// Gives what is free in the heaps back to the system. The allocator keeps it otherwise.

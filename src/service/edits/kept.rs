@@ -73,10 +73,13 @@ pub(super) struct EditedScene {
     pub(super) uncovered: Arc<OnceLock<f64>>,
 }
 
+/// Scenes whose lists stay in memory. That of another one is read again.
+const LISTS_MAX: usize = 4096;
+
 /// The lists that were read, and the edited scenes in memory.
 #[derive(Debug)]
 pub(in crate::service) struct Edits {
-    /// With the time at which each was read.
+    /// With the time at which each was read; those read last.
     lists: Mutex<HashMap<SceneId, (Instant, Arc<EditList>)>>,
     /// The last state of each scene; by the bytes of its arrays.
     pub(super) scenes: Cache<SceneId, EditedScene>,
@@ -124,7 +127,17 @@ impl Edits {
     pub(super) fn learn(&self, id: &SceneId, list: EditList) -> Arc<EditList> {
         let list = Arc::new(list);
         let now = (Instant::now(), Arc::clone(&list));
-        let before = self.lists.lock().insert(id.clone(), now);
+        let before = {
+            let mut lists = self.lists.lock();
+            let before = lists.insert(id.clone(), now);
+            if lists.len() > LISTS_MAX
+                && let Some(oldest) = lists.iter().min_by_key(|(_, (read, _))| *read)
+            {
+                let oldest = oldest.0.clone();
+                lists.remove(&oldest);
+            }
+            before
+        };
         if before.is_none_or(|(_, before)| before.sha256 != list.sha256) {
             self.changed.send_replace(());
         }
@@ -133,5 +146,26 @@ impl Edits {
 
     pub(super) fn scene(&self, id: &SceneId, tag: &str) -> Option<EditedScene> {
         self.scenes.find(id).filter(|known| known.tag == tag)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lists_that_were_read_first_are_forgotten() {
+        let edits = Edits::new(&Limits::default());
+        let id = |n: usize| {
+            let mut bytes = [0; 16];
+            bytes[..8].copy_from_slice(&n.to_le_bytes());
+            SceneId::from_bytes(bytes)
+        };
+        for n in 0..=LISTS_MAX {
+            edits.learn(&id(n), EditList::default());
+        }
+        assert!(edits.known(&id(0), None).is_none());
+        assert!(edits.known(&id(1), None).is_some() && edits.known(&id(LISTS_MAX), None).is_some());
+        assert_eq!(edits.lists.lock().len(), LISTS_MAX);
     }
 }

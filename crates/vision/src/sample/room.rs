@@ -372,16 +372,13 @@ impl Room {
 
     fn nearest(&self, from: DVec3, ray: DVec3) -> Option<(usize, Hit)> {
         let things = self.things.iter().enumerate();
-        let near = things.filter(|(_, thing)| thing.is_near(from, ray, f64::INFINITY));
-        let hits = near.filter_map(|(i, thing)| Some((i, thing.hit(from, ray)?)));
+        let hits = things.filter_map(|(i, thing)| Some((i, thing.hit(from, ray, f64::INFINITY)?)));
         hits.min_by(|a, b| a.1.t.total_cmp(&b.1.t))
     }
 
     fn blocked(&self, from: DVec3, to: DVec3) -> bool {
-        let solid = |thing: &&Thing| {
-            !matches!(thing.shape, Shape::Walls(..)) && thing.is_near(from, to, 1.0)
-        };
-        self.things.iter().filter(solid).any(|t| t.hit(from, to).is_some_and(|h| h.t < 1.0))
+        let solid = |thing: &&Thing| !matches!(thing.shape, Shape::Walls(..));
+        self.things.iter().filter(solid).any(|thing| thing.hit(from, to, 1.0).is_some())
     }
 }
 
@@ -410,9 +407,13 @@ impl Thing {
         (middle - ray * nearest).length_squared() <= reach * BALL_MARGIN
     }
 
-    fn hit(&self, from: DVec3, ray: DVec3) -> Option<Hit> {
+    /// Where a ray first meets the thing before `end`, in lengths of the ray.
+    fn hit(&self, from: DVec3, ray: DVec3, end: f64) -> Option<Hit> {
+        if !self.is_near(from, ray, end) {
+            return None;
+        }
         let (o, d) = (self.to_local(from - self.at), self.to_local(ray));
-        match self.shape {
+        let hit = match self.shape {
             Shape::Ball(radius) => {
                 let (a, b) = (d.length_squared(), o.dot(d));
                 let root = b * b - a * (o.length_squared() - radius * radius);
@@ -432,7 +433,8 @@ impl Thing {
                 hit.normal = -hit.normal;
                 (t > 1e-6).then_some(hit)
             }
-        }
+        };
+        hit.filter(|hit| hit.t < end)
     }
 }
 
