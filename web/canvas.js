@@ -312,12 +312,16 @@ function flyTo(goal) {
 
 const touches = new Map();
 let pressed = null,
-  held = null;
-// Two fingers: both have moved when the next frame is drawn, and are read together.
+  held = null,
+  asked = false;
+// Two fingers: both have moved when the next frame is drawn, and are read together. The camera is
+// that of the gesture's beginning, moved: what a frame saw of one finger alone does not stay.
 function gesture() {
-  const [before, now] = [held, [...touches.values()]];
-  held = null;
-  if (!before || now.length !== 2) return;
+  asked = false;
+  const now = [...touches.values()];
+  if (!held || now.length !== 2) return;
+  const before = held.fingers;
+  state.camera = held.camera;
   const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
   const high = $('stage').clientHeight,
     [dx, dy] = [0, 1].map((k) => (now[0][k] + now[1][k] - before[0][k] - before[1][k]) / 2);
@@ -342,8 +346,8 @@ function bindView() {
     touches.set(e.pointerId, [e.clientX, e.clientY]);
     const high = $('stage').clientHeight;
     if (touches.size === 2) {
-      if (!held) requestAnimationFrame(gesture);
-      held ||= before;
+      held ||= { fingers: before, camera: state.camera };
+      asked ||= !!requestAnimationFrame(gesture);
     } else if (!pressed || Math.hypot(e.clientX - pressed[0], e.clientY - pressed[1]) > 4) {
       pressed = null;
       const how = $('drag').selectedIndex;
