@@ -240,7 +240,7 @@ def convert(source, mirror, out):
     os.makedirs(os.path.join(out, source["name"]), exist_ok=True)
     frames = []
     shots = sorted(LAYOUTS[source["layout"]](tree, source), key=lambda s: s.path)
-    for shot in shots[:: source.get("every", 1)]:
+    for shot in shots if source["layout"] == "solved" else shots[:: source.get("every", 1)]:
         img, K = small(tree, shot)
         name = f"{len(frames):03d}.jpg"
         cv2.imwrite(os.path.join(out, source["name"], name), img, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])

@@ -116,9 +116,10 @@ class Scene:
 
 
 class Judge:
-    def __init__(self, scenes, captures, device, views=VIEWS):
-        """scenes: folder of the shared scenes; captures: folders held out; views: photos of a set."""
-        self.device, self.scenes, self.items = device, {}, []
+    def __init__(self, scenes, captures, device, views=VIEWS, input_side=SIDE):
+        """scenes: folder of the shared scenes; captures: folders held out; views: photos of a set;
+        input_side: side that the photos of 256 pixels are brought to for the network."""
+        self.device, self.input_side, self.scenes, self.items = device, input_side, {}, []
         folders = [(n, os.path.join(scenes, n), "report" if n in REPORTED else "choose") for n in sorted(os.listdir(scenes))]
         folders += [(os.path.basename(f), f, "held_out") for f in captures]
         for name, folder, use in folders:
@@ -164,7 +165,8 @@ class Judge:
         put = lambda x: x.float().to(self.device)[None]
         near, far = scene.near_far(views)
         c2w, tgt, K, Kt = put(c2w), put(tgt), put(scene.K[views]), put(scene.K[[target]])
-        img = torch.stack([scene.small[v] for v in views])[None].float() / 255
+        img = torch.stack([scene.small[v] for v in views]).float() / 255
+        img = F.interpolate(img, (self.input_side, self.input_side), mode="bilinear", align_corners=False)[None]
         nb = nearest_views(c2w, min(len(views) - 1, 3))
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             out = net(img, K, c2w, put(near / s), put(far / s), nb)

@@ -126,8 +126,8 @@ class Captures:
     def about(self):
         return {c.name: [len(c.images)] + [len(s) for s in c.triples] for c in self.all}
 
-    def batch(self, B, V, T, H, W, zoom=1):
-        """B sets in the model frame: images [B,V,3,H,W], targets [B,T,3,zoom H,zoom W], mask
+    def batch(self, B, V, T, size, target_size):
+        """B sets in the model frame: images [B,V,3,*size], targets [B,T,3,*target_size], mask
         [B,T,1,..] of what an input may see, K [B,V+T,3,3] normalised, c2w [B,V+T,4,4], near/far [B,V].
         """
         sets = []
@@ -135,15 +135,15 @@ class Captures:
             capture = self.all[self.rng.choice(len(self.all), p=self.share)]
             got = capture.draw(self.rng, V, T)
             if got:
-                sets.append(self.one(capture, *got, H, W, zoom))
+                sets.append(self.one(capture, *got, size, target_size))
         images, targets, K, c2w, near, far, own = zip(*sets)
         put = lambda x: torch.from_numpy(np.stack(x)).float().to(self.device)
         K, c2w = put(K), put(c2w)
-        mask = seen(K, c2w, put(own), V, H // 8, W // 8)
-        mask = F.interpolate(mask.flatten(0, 1), (H * zoom, W * zoom), mode="nearest").reshape(B, T, 1, H * zoom, W * zoom)
+        mask = seen(K, c2w, put(own), V, *(length // 8 for length in target_size))
+        mask = F.interpolate(mask.flatten(0, 1), target_size, mode="nearest").reshape(B, T, 1, *target_size)
         return torch.stack(images), torch.stack(targets), mask, K, c2w, put(near), put(far)
 
-    def one(self, capture, views, targets, H, W, zoom):
+    def one(self, capture, views, targets, size, target_size):
         r = self.rng
         flip, part = r.random() < 0.5, 1.0 if r.random() < 0.5 else r.uniform(0.7, 1.0)
         at = r.uniform(0.2, 0.8, 2) if part < 1 else np.array([0.5, 0.5])
@@ -151,8 +151,7 @@ class Captures:
         pics, Ks = [], []
         mean = capture.gain[views].mean(0)
         for n, k in enumerate([*views, *targets]):
-            zoomed = zoom if n >= len(views) else 1
-            img, K = crop(capture.images[k], capture.K[k], H, W, part, at, zoomed, flip)
+            img, K = crop(capture.images[k], capture.K[k], target_size if n >= len(views) else size, part, at, flip)
             gain = light * np.exp(mean - capture.gain[k]) if n >= len(views) else light
             pics.append((img * torch.tensor(gain, device=img.device, dtype=torch.float32)[:, None, None]).clamp(0, 1))
             Ks.append(K)
@@ -178,16 +177,17 @@ class Captures:
         return 1 / hi, 1 / lo
 
 
-def crop(img, K, H, W, part, at, zoom, flip):
-    """A part of a photo in the shape of the bucket, at `zoom` times H x W; K normalised."""
+def crop(img, K, size, part, at, flip):
+    """A part of a photo in the shape of a size (height, width), at that size; K normalised."""
     h, w = img.shape[1:]
+    H, W = size
     aspect = W / H
     cw, ch = (h * aspect, h) if w / h > aspect else (w, w / aspect)
     cw, ch = cw * part, ch * part
     x0, y0 = (w - cw) * at[0], (h - ch) * at[1]
     # Twice the samples, averaged: no aliasing at reductions up to about 2.5.
-    more = 2 if cw > 1.2 * W * zoom else 1
-    oh, ow = H * zoom * more, W * zoom * more
+    more = 2 if cw > 1.2 * W else 1
+    oh, ow = H * more, W * more
     theta = torch.tensor([[cw / w, 0, (2 * x0 + cw) / w - 1], [0, ch / h, (2 * y0 + ch) / h - 1]], device=img.device, dtype=torch.float32)
     if flip:
         theta[0, 0] *= -1

@@ -77,7 +77,7 @@ def main():
             c.bins = torch.zeros(BINS, dtype=torch.long, device=device)
         for k in range(args.batches):
             views, (h, w) = VIEWS[k % len(VIEWS)], SHAPES[k // len(VIEWS) % len(SHAPES)]
-            images, _, _, K, c2w, near, far = captures.batch(max(args.photos // views, 1), views, 1, h, w)
+            images, _, _, K, c2w, near, far = captures.batch(max(args.photos // views, 1), views, 1, (h, w), (h, w))
             net(images, K[:, :views], c2w[:, :views], near, far, nearest_views(c2w[:, :views], 3))
     with open(args.out, "w") as file:
         json.dump({name: c.range() for name, c in counts.items()}, file, indent=0)

@@ -200,12 +200,13 @@ class World:
         return quat_to_rot(q)
 
     # -- one batch
-    def batch(self, B, V, T, H, W, wide=1.0, zoom=1):
-        """B scenes, V input views of H x W and T target views of `zoom` times that; model frame.
+    def batch(self, B, V, T, size, target_size, wide=1.0):
+        """B scenes, V input and T target views of (height, width); model frame.
 
-        Returns images [B,V,3,H,W], targets [B,T,3,zoom H,zoom W], depth [B,V,H,W], K [B,V+T,3,3]
+        Returns images [B,V,3,*size], targets [B,T,3,*target_size], depth [B,V,*size], K [B,V+T,3,3]
         normalised, c2w [B,V+T,4,4], near/far [B,V].
         """
+        H, W = size
         mode = self.u(B)
         room, table, relief = mode < 0.38, (mode >= 0.38) & (mode < 0.72), (mode >= 0.72) & (mode < 0.84)
         pitch = torch.where(table, self.u(B, lo=12, hi=65), torch.where(room, self.u(B, lo=-12, hi=28), self.u(B, lo=-12, hi=12)))
@@ -216,7 +217,7 @@ class World:
         cams, K = self.rig(B, V, T, H, W, b, focus, wide)
         inst, lights = self.layout(B, room, table, relief, focus, b, cams)
         images, depth = self.draw(inst, lights, cams[:, :V], K[:, :V], H, W)
-        targets, _ = self.draw(inst, lights, cams[:, V:], K[:, V:], H * zoom, W * zoom)
+        targets, _ = self.draw(inst, lights, cams[:, V:], K[:, V:], *target_size)
         # Model frame.
         scale = torch.cdist(cams[:, :V, :3, 3], cams[:, :V, :3, 3]).flatten(1).amax(1)
         c2w = torch.linalg.inv(cams[:, :1]) @ cams

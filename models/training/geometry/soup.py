@@ -49,7 +49,7 @@ def judged(args, states):
     if device.type == "cuda":
         torch.cuda.set_device(device)
     held_out = [os.path.dirname(p) for p in sorted(glob.glob(os.path.join(args.data, "*", "cameras.json"))) if '"held_out": true' in open(p).read(400)]
-    judge = Judge(args.scenes, held_out, device, args.views)
+    judge = Judge(args.scenes, held_out, device, args.views, args.side)
     net = GeometryNet().to(device).eval()
     with open(os.path.join(args.out, f"soup-{part}.jsonl"), "w") as file:
         for shares in mixes(len(args.runs), args.start_shares)[part::parts]:
@@ -85,6 +85,7 @@ def main():
     ap.add_argument("--data")
     ap.add_argument("--every", type=int, default=1)
     ap.add_argument("--views", type=int, nargs="*", default=[2], help="photos of the sets that are judged")
+    ap.add_argument("--side", type=int, default=256, help="side of the network's inputs")
     ap.add_argument("--start-shares", type=float, nargs="*", default=START_SHARES)
     ap.add_argument("--gpu", type=int, help="device, where it is not the number of the part")
     ap.add_argument("--part", help="I/N: this process judges every Nth mix")

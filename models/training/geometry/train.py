@@ -8,7 +8,8 @@ DATA it is the recipe from nothing: rendered rooms alone, depth alone at first.
 
 Loss of rendered rooms: inverse depth relative to the searched range at three scales, cross entropy
 of the sweep, and unseen views drawn by gsplat (classic mode, as the product draws). Loss of real
-photos: the unseen views alone. A third of the views has twice the pixels of the inputs.
+photos: the unseen views alone. Inputs and views have pixels of their own; a share of the inputs is
+of small photos, as the product brings them to the network's size.
 Everything is seeded; the schedule follows the share of time used.
 """
 import argparse
@@ -22,6 +23,7 @@ import time
 
 import torch
 import torch.distributed as dist
+import torch.nn.functional as F
 
 from judge import VIEWS as VIEWS_JUDGED
 from judge import Judge
@@ -29,7 +31,8 @@ from model import GeometryNet
 from splats import depth_loss, nearest_views, picture_loss, render, with_inputs
 
 HERE = os.path.dirname(os.path.abspath(__file__))
-SHAPES = [(256, 256)] * 7 + [(224, 288), (288, 224), (192, 320), (320, 192)]
+ASPECTS = [1] * 7 + [4 / 3, 3 / 4, 5 / 3, 3 / 5]  # width over height
+SMALL = 256  # root of the pixels of a small photo
 VIEWS = ["2:0.5", "3:0.08", "4:0.18", "6:0.09", "8:0.15"]
 PART = 15 << 20  # bytes of one file of weights
 
@@ -54,10 +57,13 @@ def parse():
     ap.add_argument("--views", nargs="*", default=VIEWS, help="photos of a set and how often it is drawn, N:SHARE")
     ap.add_argument("--robust", type=float, help="an error of a real photo far over this counts no more")
     ap.add_argument("--log-weight", type=float, default=0.02, help="of the logarithm of the error in the loss")
-    ap.add_argument("--zoom-share", type=float, default=0.3, help="share of the views with twice the pixels")
+    ap.add_argument("--target-sides", nargs="*", default=["256:0.7", "512:0.3"], help="the same of a view")
+    ap.add_argument("--small-share", type=float, default=0.0, help="share of the steps whose photos are small")
+    ap.add_argument("--judge-side", type=int, default=SMALL, help="side of the inputs that are judged; the photos are small")
     ap.add_argument("--judge-views", type=int, nargs="*", default=VIEWS_JUDGED, help="photos of the sets that are judged")
     ap.add_argument("--warm-up", type=int, default=200, help="steps")
-    ap.add_argument("--batch", type=int, default=16, help="pairs a step; fewer sets of more views")
+    ap.add_argument("--batch", type=int, default=16, help="pairs a step of 256 x 256; fewer sets of more views and of more pixels")
+    ap.add_argument("--sides", nargs="*", default=["256:1"], help="roots of the pixels of an input and how often each is drawn, SIDE:SHARE")
     ap.add_argument("--eight-bits", nargs="+", metavar="FILE", help="GRAPH RANGES [FIRST]: round as the CPU file does (eight_bits.py)")
     ap.add_argument("--float-share", type=float, default=0.2, help="share of the steps without these roundings")
     return ap.parse_args()
@@ -107,13 +113,31 @@ class Data:
 
             self.photos = Captures(args.data, ranks.device, seed, args.only)
 
-    def batch(self, real, B, V, T, H, W, zoom, wide):
+    def batch(self, real, B, V, T, size, target_size, wide):
         """(images, targets, mask or None, depth or None, K, c2w, near, far)."""
         if real:
-            images, targets, mask, K, c2w, near, far = self.photos.batch(B, V, T, H, W, zoom)
+            images, targets, mask, K, c2w, near, far = self.photos.batch(B, V, T, size, target_size)
             return images, targets, mask, None, K, c2w, near, far
-        images, targets, depth, K, c2w, near, far = self.world.batch(B, V, T, H, W, wide, zoom)
+        images, targets, depth, K, c2w, near, far = self.world.batch(B, V, T, size, target_size, wide)
         return images, targets, None, depth, K, c2w, near, far
+
+
+def drawn(draw, choices):
+    """One of the numbers NUMBER:SHARE."""
+    numbers, shares = zip(*(each.split(":") for each in choices))
+    return int(draw.choices(numbers, [float(share) for share in shares])[0])
+
+
+def shape(side, aspect):
+    """(height, width), multiples of 32, of about side^2 pixels."""
+    return tuple(32 * round(length / 32) for length in (side / math.sqrt(aspect), side * math.sqrt(aspect)))
+
+
+def resized(x, size, mode):
+    """[B,V,...,h,w] at another size."""
+    many = x.flatten(0, 1) if x.ndim == 5 else x
+    how = {} if mode == "nearest" else {"align_corners": False}
+    return F.interpolate(many, size, mode=mode, **how).reshape(*x.shape[:-2], *size)
 
 
 def extension():
@@ -162,7 +186,7 @@ class Trainer:
         self.say(loaded=round(time.time() - start, 1), captures=self.data.photos.about() if self.data.photos else None)
         if args.scenes and ranks.rank == 0:
             held_out = [os.path.dirname(p) for p in sorted(glob.glob(os.path.join(args.data or "", "*", "cameras.json"))) if '"held_out": true' in open(p).read(400)]
-            self.judge_of = Judge(args.scenes, held_out, ranks.device, args.judge_views)
+            self.judge_of = Judge(args.scenes, held_out, ranks.device, args.judge_views, args.judge_side)
             self.say(judge_loaded=round(time.time() - start, 1), triples=len(self.judge_of.items))
 
     def say(self, **kw):
@@ -228,13 +252,15 @@ class Trainer:
         real = self.data.photos is not None and draw.random() < args.real_share
         depth_only = share < args.depth_share and not args.init
         wide = 1.0 if args.init else min(max((share - 0.08) / 0.4, 0.0), 1.0)
-        counts, shares = zip(*(each.split(":") for each in args.views))
-        V = int(draw.choices(counts, [float(share) for share in shares])[0])
-        H, W = draw.choice(SHAPES)
-        zoom = 2 if draw.random() < args.zoom_share and not depth_only else 1
-        B, T = max(args.batch * 2 // V, 1), 2 if zoom == 1 else 1
+        V, side = drawn(draw, args.views), drawn(draw, args.sides)
+        target_side, aspect = drawn(draw, args.target_sides), draw.choice(ASPECTS)
+        size, target_size = shape(side, aspect), shape(target_side, aspect)
+        small = draw.random() < args.small_share and side > SMALL
+        B, T = max(round(args.batch * 2 / V * (SMALL / side) ** 2), 1), 2 if target_side < 1.3 * side else 1
         with torch.no_grad():
-            images, targets, mask, depth, K, c2w, near, far = self.data.batch(real, B, V, T, H, W, zoom, wide)
+            images, targets, mask, depth, K, c2w, near, far = self.data.batch(real, B, V, T, shape(SMALL, aspect) if small else size, target_size, wide)
+            if small:
+                images, depth = resized(images, size, "bilinear"), depth if depth is None else resized(depth, size, "nearest")
         lr = args.lr * min(1.0, (self.step + 1) / args.warm_up) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(share, 1))))
         for group in self.opt.param_groups:
             group["lr"] = lr
@@ -247,7 +273,7 @@ class Trainer:
             dl, ce, err = depth_loss(out, depth, near, far)
             loss = dl + 0.05 * ce
         if not depth_only:
-            pic = render(with_inputs(out, images, K[:, :V], c2w[:, :V]), c2w[:, V:], K[:, V:], H * zoom, W * zoom).flatten(0, 1)
+            pic = render(with_inputs(out, images, K[:, :V], c2w[:, :V]), c2w[:, V:], K[:, V:], *target_size).flatten(0, 1)
             want = targets.flatten(0, 1)
             if mask is not None:  # where no input looks there is nothing to learn
                 want = torch.where(mask.flatten(0, 1) > 0, want, pic.detach())
@@ -256,7 +282,7 @@ class Trainer:
         self.update(loss)
         kind = ("real" if real else "made") + ("q" if self.rounding and self.rounding.on else "")
         if mse is not None:
-            self.add(f"{kind}{V}" + ("x2" if zoom == 2 else ""), -10 * math.log10(max(mse.item(), 1e-9)))
+            self.add(f"{kind}{V}@{side}" + ("small" if small else ""), -10 * math.log10(max(mse.item(), 1e-9)))
         if err is not None:
             self.add("depth", err.item())
 
