@@ -58,19 +58,17 @@ pub fn offline(config: &Config, texts: bool) -> Result<OfflineService> {
 /// `model_unavailable` when its file of words cannot be read.
 pub fn models_info(bundle: &Bundle, execution_provider: &str) -> Result<ModelsInfo> {
     let geometry = bundle.geometry();
-    let weights = geometry.weights();
     let models = bundle.files().into_iter().map(|entry| {
-        let of = weights.iter().rfind(|of| entry.part.starts_with(of.part));
-        let (views_max, sizes) = match (entry.part, of) {
-            (_, Some(of)) => (geometry.views_max, of.buckets.to_vec()),
-            ("masks.encoder", _) => (1, bundle.masks().map(|m| [m.size; 2]).into_iter().collect()),
-            ("image_text.image", _) => {
+        let (views_max, sizes) = match entry.part {
+            part if part.starts_with("geometry") => (geometry.views_max, geometry.buckets.clone()),
+            "masks.encoder" => (1, bundle.masks().map(|m| [m.size; 2]).into_iter().collect()),
+            "image_text.image" => {
                 (1, bundle.image_text().map(|m| [m.image.size; 2]).into_iter().collect())
             }
-            ("text_masks.image", _) => {
+            "text_masks.image" => {
                 (1, bundle.text_masks().map(|m| [m.size; 2]).into_iter().collect())
             }
-            ("cameras", _) => (bundle.cameras().map_or(0, |m| m.views_max), Vec::new()),
+            "cameras" => (bundle.cameras().map_or(0, |m| m.views_max), Vec::new()),
             _ => (0, Vec::new()),
         };
         ModelInfo {

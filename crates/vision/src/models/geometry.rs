@@ -53,8 +53,6 @@ pub struct Geometry {
 struct ByViews {
     part: &'static str,
     views: RangeInclusive<usize>,
-    /// `[height, width]` that they work at.
-    buckets: Vec<[u32; 2]>,
     network: Network,
 }
 
@@ -68,28 +66,27 @@ impl Geometry {
     pub fn open(runtime: &Arc<Runtime>, bundle: &Bundle, options: &NetworkOptions) -> Result<Self> {
         let manifest = bundle.geometry();
         let open = |weights: GeometryWeights<'_>| {
-            let probe = Tensors::probe(manifest, weights.buckets[0], *weights.views.start());
+            let probe = Tensors::probe(manifest, manifest.buckets[0], *weights.views.start());
             let spec = Spec {
                 what: WHAT,
                 file: weights.file,
                 cpu_file: weights.cpu_file,
-                signature: signature(manifest, &weights),
+                signature: signature(manifest, *weights.views.start()),
                 memory: RunMemory::GivenBack,
                 tolerance: TOLERANCE,
                 probe: &|_| Ok(probe.inputs(manifest)),
             };
             let network = Network::open(runtime, bundle, options, &spec)?;
-            let GeometryWeights { part, views, buckets, .. } = weights;
-            Ok(ByViews { part, views, buckets: buckets.to_vec(), network })
+            Ok(ByViews { part: weights.part, views: weights.views, network })
         };
         let networks = manifest.weights().into_iter().map(open).collect::<Result<_>>()?;
         Ok(Self { networks, manifest: manifest.clone() })
     }
 
     /// The network for sets of so many views.
-    fn network_for(&self, views: usize) -> Result<&ByViews> {
+    fn network_for(&self, views: usize) -> Result<&Network> {
         let found = self.networks.iter().find(|network| network.views.contains(&views));
-        found.ok_or_else(|| {
+        found.map(|found| &found.network).ok_or_else(|| {
             let GeometryManifest { views_min, views_max, .. } = self.manifest;
             Error::internal(format!("{WHAT}: {views} views, outside {views_min} to {views_max}"))
         })
@@ -106,8 +103,8 @@ impl Geometry {
         }
         let manifest = &self.manifest;
         for views in WARM_VIEWS {
-            let Ok(ByViews { buckets, network, .. }) = self.network_for(views) else { continue };
-            for &bucket in buckets {
+            let Ok(network) = self.network_for(views) else { continue };
+            for &bucket in &manifest.buckets {
                 let probe = Tensors::probe(manifest, bucket, views);
                 network.run(&probe.inputs(manifest), |_| Ok(()))?;
             }
@@ -123,9 +120,9 @@ impl Geometry {
     /// a number that is not finite.
     pub(super) fn try_out(&self) -> Result<()> {
         let manifest = &self.manifest;
-        for ByViews { views, buckets, network, .. } in &self.networks {
+        for ByViews { views, network, .. } in &self.networks {
             for views in BTreeSet::from([*views.start(), *views.end()]) {
-                for &bucket in buckets {
+                for &bucket in &manifest.buckets {
                     let probe = Tensors::probe(manifest, bucket, views);
                     network.run(&probe.inputs(manifest), |outputs| {
                         Answer::read(manifest, bucket, views, outputs)?.finite()
@@ -168,8 +165,8 @@ impl Geometry {
     /// `invalid_request` when all cameras stand at one place; `internal` when the set does not fit
     /// the network, or the network fails or answers with other shapes than its manifest says.
     pub fn run(&self, input: &GeometryInput<'_>) -> Result<Vec<ViewGaussians>> {
-        let ByViews { buckets, network, .. } = self.network_for(input.views.len())?;
-        let prepared = self.prepare(input, buckets)?;
+        let network = self.network_for(input.views.len())?;
+        let prepared = self.prepare(input)?;
         let inputs = prepared.tensors.inputs(&self.manifest);
         network.run(&inputs, |outputs| self.views(input, &prepared, outputs))
     }
@@ -214,7 +211,7 @@ impl Geometry {
         Ok(input.views.iter().zip(&prepared.fitted).enumerate().map(view).collect())
     }
 
-    fn prepare(&self, input: &GeometryInput<'_>, buckets: &[[u32; 2]]) -> Result<Prepared> {
+    fn prepare(&self, input: &GeometryInput<'_>) -> Result<Prepared> {
         let (count, manifest) = (input.views.len(), &self.manifest);
         let each = input.neighbors.first().map_or(0, Vec::len);
         let fits = |row: &Vec<usize>| row.len() == each && row.iter().all(|&n| n < count);
@@ -237,7 +234,7 @@ impl Geometry {
         }
         let lenses: Vec<Intrinsics> =
             input.views.iter().map(|&v| input.photos[v].camera.intrinsics).collect();
-        let bucket = bucket_for(&lenses, buckets)
+        let bucket = bucket_for(&lenses, &manifest.buckets)
             .ok_or_else(|| Error::internal(format!("{WHAT}: no buckets")))?;
         let fitted: Vec<FittedPhoto> = input
             .views
@@ -348,19 +345,19 @@ fn sh_count(manifest: &GeometryManifest) -> usize {
 /// Each file with its tensors.
 pub(super) fn signatures(manifest: &GeometryManifest) -> Vec<Signature<'_>> {
     let mut all = Vec::new();
-    for weights in manifest.weights() {
-        let files = [Some(weights.file), weights.cpu_file].into_iter().flatten();
-        all.extend(files.map(|file| (WHAT, file, signature(manifest, &weights))));
+    for GeometryWeights { file, cpu_file, views, .. } in manifest.weights() {
+        let files = [Some(file), cpu_file].into_iter().flatten();
+        all.extend(files.map(|file| (WHAT, file, signature(manifest, *views.start()))));
     }
     all
 }
 
-/// The tensors of the manifest, for the fewest views of the weights and more: a caller of the
-/// network itself may give one with weights for few views as many as the manifest allows.
-fn signature<'a>(manifest: &'a GeometryManifest, weights: &GeometryWeights<'_>) -> Vec<Wanted<'a>> {
+/// The tensors of the manifest, for so many views and more: a caller of the network itself may give
+/// one with weights for few views as many as the manifest allows.
+fn signature(manifest: &GeometryManifest, least: usize) -> Vec<Wanted<'_>> {
     let (inputs, outputs) = (&manifest.inputs, &manifest.outputs);
-    let views: Vec<usize> = (*weights.views.start()..=manifest.views_max).collect();
-    let side = |axis: usize| weights.buckets.iter().map(|b| b[axis] as usize).collect::<Vec<_>>();
+    let views: Vec<usize> = (least..=manifest.views_max).collect();
+    let side = |axis: usize| manifest.buckets.iter().map(|b| b[axis] as usize).collect::<Vec<_>>();
     let of = |side, name, tail: &[&[usize]]| {
         let shape = [&[&*views], tail].concat().into_iter().map(<[usize]>::to_vec).collect();
         Wanted::new(side, name, shape)

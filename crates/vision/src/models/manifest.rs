@@ -206,8 +206,6 @@ pub struct ManyViews {
     pub sha256: String,
     /// The same as the CPU runs it, where that is another file.
     pub cpu: Option<PlainFile>,
-    /// Working sizes of such sets, `[height, width]`; absent: those of all sets.
-    pub buckets: Option<Vec<[u32; 2]>>,
 }
 
 /// A geometry network's weights, and the sets that they are for.
@@ -221,8 +219,6 @@ pub struct GeometryWeights<'a> {
     pub cpu_file: Option<&'a str>,
     /// Views of a set.
     pub views: RangeInclusive<usize>,
-    /// Working sizes, `[height, width]`.
-    pub buckets: &'a [[u32; 2]],
 }
 
 impl GeometryManifest {
@@ -236,14 +232,12 @@ impl GeometryManifest {
             file: &self.file,
             cpu_file: self.cpu.as_ref().map(|cpu| &*cpu.file),
             views: least..=most,
-            buckets: &self.buckets,
         };
         let many = self.many.as_ref().map(|many| GeometryWeights {
             part: "geometry.many",
             file: &many.file,
             cpu_file: many.cpu.as_ref().map(|cpu| &*cpu.file),
             views: many.views_min..=self.views_max,
-            buckets: many.buckets.as_ref().unwrap_or(&self.buckets),
         });
         [Some(few), many].into_iter().flatten().collect()
     }
@@ -261,16 +255,10 @@ impl GeometryManifest {
             let larger = self.views_min.max(2) + 1..=self.views_max;
             faults.range("geometry.many.views_min", many.views_min, larger);
         }
-        let of_many = self.many.as_ref().and_then(|many| many.buckets.as_ref());
-        let sizes = [("geometry.buckets", Some(&self.buckets)), ("geometry.many.buckets", of_many)];
         let bad = |side: &u32| !(1..=BUCKET_SIDE_MAX).contains(side);
-        for (key, buckets) in sizes {
-            if let Some(buckets) = buckets
-                && (buckets.is_empty() || buckets.iter().flatten().any(bad))
-            {
-                let must = format!("hold [height, width] pairs of 1 to {BUCKET_SIDE_MAX}");
-                faults.wrong(key, buckets, &must);
-            }
+        if self.buckets.is_empty() || self.buckets.iter().flatten().any(bad) {
+            let must = format!("hold [height, width] pairs of 1 to {BUCKET_SIDE_MAX}");
+            faults.wrong("geometry.buckets", &self.buckets, &must);
         }
         if self.views_min < 1 || self.views_max < self.views_min || self.views_max < 2 {
             faults.0.push(format!(

@@ -65,12 +65,6 @@ fn every_file_of_semantics_is_checked_and_its_keys_too() {
     for (from, to, named) in [
         ("views_min = 5", "views_min = 2", "geometry.many.views_min is 2"),
         ("views_min = 5", "views_min = 9", "geometry.many.views_min is 9"),
-        ("views_min = 5", "views_min = 5\nbuckets = []", "geometry.many.buckets is []"),
-        (
-            "views_min = 5",
-            "views_min = 5\nbuckets = [[64, 0]]",
-            "geometry.many.buckets is [[64, 0]]",
-        ),
         ("views_min = 5\nfile = \"", "views_min = 5\nfile = \"../", "plain file name"),
         ("adapter = \"sam\"", "adapter = \"other\"", "unknown variant"),
         ("size = 64", "size = 0", "masks.size is 0"),
