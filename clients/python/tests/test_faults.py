@@ -49,6 +49,12 @@ class Faulty(httpx.BaseTransport):
         return fault(request, answer) if fault else answer
 
 
+def lose(_: httpx.Request, answer: httpx.Response) -> httpx.Response:
+    """The server has done it, and its answer does not come."""
+    answer.read()
+    raise httpx.ReadError("the connection broke")
+
+
 @pytest.fixture
 def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The times that were waited; nothing waits."""
@@ -132,13 +138,12 @@ def test_a_call_is_not_sent_more_often_than_that(
 def test_a_create_whose_answer_is_lost_makes_one_scene(
     client: Client, url: str, photos: Path, slept: list[float]
 ) -> None:
-    def lose(_: httpx.Request, answer: httpx.Response) -> httpx.Response:
-        answer.read()
+    def taken(request: httpx.Request, answer: httpx.Response) -> httpx.Response:
         assert answer.status_code == 202, "the server has taken it"
-        raise httpx.ReadError("the connection broke")
+        return lose(request, answer)
 
     before = [scene.id for scene in client.scenes()]
-    faulty = Faulty("/v1/scenes", refusal(429, "overloaded", 2), lose)
+    faulty = Faulty("/v1/scenes", refusal(429, "overloaded", 2), taken)
     scene = Client(url, transport=faulty).scene(photos, wait=False, semantics="off")
     assert len(faulty.seen) == 3 and slept == [2, 0.5]
     assert len({request.headers["idempotency-key"] for request in faulty.seen}) == 1
@@ -149,16 +154,65 @@ def test_a_create_whose_answer_is_lost_makes_one_scene(
 def test_a_delete_whose_answer_is_lost_is_done(
     client: Client, url: str, photos: Path, slept: list[float]
 ) -> None:
-    def lose(_: httpx.Request, answer: httpx.Response) -> httpx.Response:
-        answer.read()
-        raise httpx.ReadError("the connection broke")
-
     scene = client.scene(photos, wait=False, semantics="off")
     faulty = Faulty(f"/v1/scenes/{scene.id}")
     again = Client(url, transport=faulty).get(scene.id)
-    faulty.faults = [lose]
+    faulty.faults = [lose, refusal(503, "stopping", 1)]
     again.delete()
-    assert [request.method for request in faulty.seen] == ["GET", "DELETE", "DELETE"]
+    assert [request.method for request in faulty.seen] == ["GET", *["DELETE"] * 3]
+    faulty.faults = [refusal(429, "overloaded", 1)]
+    with pytest.raises(segsplat.SceneNotFound) as gone:
+        again.delete()
+    assert gone.value.call == f"DELETE {url}/v1/scenes/{scene.id}"
+
+
+def test_a_photo_leaves_though_the_answer_is_lost(
+    url: str, tmp_path: Path, slept: list[float]
+) -> None:
+    run("sample", "--photos", "3", "-o", tmp_path / "photos")
+    faulty = Faulty("/photos/", lose, refusal(503, "stopping", 1))
+    scene = Client(url, transport=faulty).scene(tmp_path / "photos", semantics="off", refine="off")
+    scene.remove(scene.photos[0])
+    assert [request.method for request in faulty.seen] == ["DELETE"] * 3
+    assert len(scene.photos) == 2 and scene.status.version == 2, "it was waited for"
+    # A server that is overloaded has not done it.
+    faulty.faults = [refusal(429, "overloaded", 1)]
+    with pytest.raises(segsplat.NotFound, match="no photo"):
+        scene.remove("absent.png")
+    scene.delete()
+
+
+@pytest.mark.parametrize(
+    ("path", "ask"),
+    [
+        ("/views", lambda scene: [*scene.views([{"from_": 0}], width=32)]),
+        ("/views", lambda scene: scene.view(["color", "depth"], width=32)),
+        ("/events", lambda scene: [*scene.events()]),
+        ("/events", lambda scene: scene.wait()),
+        ("/export", lambda scene: scene.export()),
+    ],
+)
+@pytest.mark.parametrize(
+    ("answer", "error"),
+    [
+        (refusal(429, "overloaded", 1), segsplat.Overloaded),
+        (httpx.Response(502, text="<html>bad"), segsplat.ConnectionLost),
+    ],
+)
+def test_a_stream_is_not_asked_for_more_often_than_that(
+    scene: Scene,
+    url: str,
+    slept: list[float],
+    path: str,
+    ask: Callable[[Scene], Any],
+    answer: httpx.Response,
+    error: type[SegSplatError],
+) -> None:
+    faulty = Faulty(path, *[answer] * 99)
+    again = Client(url, transport=faulty, retries=2).get(scene.id)
+    with pytest.raises(error) as told:
+        ask(again)
+    assert len(faulty.seen) == 3 and told.value.call
 
 
 class Broken(httpx.SyncByteStream):
@@ -263,6 +317,41 @@ def test_a_server_of_another_version_is_warned_of_once(
         warnings.simplefilter("error")
         client.get(scene.id)
     assert len(faulty.seen) == 1
+
+
+@pytest.mark.parametrize(
+    "fault", [refusal(429, "overloaded", 1), httpx.Response(502, text="<html>bad"), lose]
+)
+def test_limits_are_asked_for_again(
+    scene: Scene, url: str, slept: list[float], fault: httpx.Response | Answering
+) -> None:
+    faulty = Faulty("/v1/models", fault)
+    client = Client(url, transport=faulty)
+    client.get(scene.id)
+    assert client.policy.limits and len(faulty.seen) == 2
+    # Where no try succeeds the call does not, and the next asks again.
+    faulty = Faulty("/v1/models", *[fault] * 3)
+    client = Client(url, transport=faulty, retries=2)
+    with pytest.raises(SegSplatError, match="GET .*/v1/models"):
+        client.get(scene.id)
+    client.get(scene.id)
+    assert client.policy.limits and len(faulty.seen) == 4
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        httpx.Response(404, text="<html>nothing here"),
+        httpx.Response(200, json={"server_version": segsplat.__version__}),
+    ],
+)
+def test_a_server_that_says_no_limits_is_left_alone(
+    scene: Scene, url: str, answer: httpx.Response
+) -> None:
+    faulty = Faulty("/v1/models", answer)
+    client = Client(url, transport=faulty)
+    client.get(scene.id)
+    assert client.policy.limits is None and len(faulty.seen) == 1
 
 
 def test_the_version_is_that_of_the_server(client: Client) -> None:

@@ -102,13 +102,19 @@ def test_a_server_that_does_not_start_says_why() -> None:
         segsplat.local(flags=["--no-such-flag"])
 
 
-def test_a_server_that_says_nothing_is_not_waited_for(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("first", "start_s", "why"),
+    [("", 0.5, "said nothing for 0.5 s"), ("echo hello; ", 120, "said:\nhello$")],
+)
+def test_a_server_that_never_listens_is_not_waited_for(
+    tmp_path: Path, first: str, start_s: float, why: str
+) -> None:
     slow = tmp_path / "slow"
-    slow.write_text("#!/bin/sh\nexec sleep 600\n")
+    slow.write_text(f"#!/bin/sh\n{first}exec sleep 600\n")
     slow.chmod(stat.S_IRWXU)
     begun = time.monotonic()
-    with pytest.raises(segsplat.ServerNotStarted, match="said nothing for 0.5 s"):
-        segsplat.local(program=slow, start_s=0.5)
+    with pytest.raises(segsplat.ServerNotStarted, match=why):
+        segsplat.local(program=slow, start_s=start_s)
     assert time.monotonic() - begun < 300, "it was waited for"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import os
 import posixpath
@@ -23,6 +24,8 @@ from .errors import (
     BadAnswer,
     ConnectionLost,
     InvalidRequest,
+    NotFound,
+    Overloaded,
     SceneNotFound,
     SegSplatError,
     error_of,
@@ -55,6 +58,7 @@ from .types import (
 from .video import VIDEOS, frames_of
 from .view import FORMATS, View, picture
 from .wire import (
+    Answer,
     Flow,
     Item,
     Multipart,
@@ -328,19 +332,25 @@ def refresh(scene: Handle) -> Flow[None]:
 
 def delete(scene: Handle) -> Flow[None]:
     """Deletes the scene, and stops it where it is being made."""
-    lost = False
-    for again in range(scene.policy.retries + 1):
+    yield from _deleted(scene, Request("DELETE", f"/v1/scenes/{scene.id}"))
+
+
+def _deleted(scene: Handle, request: Request) -> Flow[Answer | None]:
+    """Deletes something; None where an earlier try has done so, whose answer was lost."""
+    once = Policy(0, 0, False, server=scene.policy.server)
+    maybe_done = False
+    for again in itertools.count():
         try:
-            yield from send(Policy(0, 0, False), Request("DELETE", f"/v1/scenes/{scene.id}"))
-            return
-        except SceneNotFound:
-            # The answer to the first try was lost.
-            if lost:
-                return
+            return (yield from send(once, request))
+        except (SceneNotFound, NotFound):
+            if maybe_done:
+                return None
             raise
         except SegSplatError as error:
-            lost = isinstance(error, ConnectionLost)
+            # One that is overloaded has not begun. Others may have failed after the deletion.
+            maybe_done = maybe_done or not isinstance(error, Overloaded)
             yield from pause(scene.policy, error, again)
+    raise AssertionError("unreachable")
 
 
 def events(
@@ -361,10 +371,11 @@ def events(
              (("semantics", semantics), ("edits", edits)) if is_asked}
     again = 0
     while True:
+        path = f"/v1/scenes/{scene.id}/events"
+        request = Request("GET", path, params=asked, stream=ServerSentEvents)
+        # Outside of `try`: it has its own tries.
+        yield from send(scene.policy, request)
         try:
-            path = f"/v1/scenes/{scene.id}/events"
-            request = Request("GET", path, params=asked, stream=ServerSentEvents)
-            yield from send(scene.policy, request)
             made = False
             while (data := (yield Read())) is not None:
                 again, event = 0, parse(Event, _json(data))
@@ -446,7 +457,7 @@ def add(
         upload=parts_of(source, scene.policy.limits) + masks_in(masks),
         headers={"idempotency-key": idempotency_key or str(uuid4())},
     )
-    yield from _changed(scene, request, progress)
+    yield from _changed(scene, (yield from send(scene.policy, request)), progress)
 
 
 def remove(scene: Handle, photo: str | Photo, progress: Progress = None) -> Flow[None]:
@@ -458,13 +469,13 @@ def remove(scene: Handle, photo: str | Photo, progress: Progress = None) -> Flow
     """
     name = quote(photo if isinstance(photo, str) else photo.file, safe="")
     request = Request("DELETE", f"/v1/scenes/{scene.id}/photos/{name}")
-    yield from _changed(scene, request, progress)
+    yield from _changed(scene, (yield from _deleted(scene, request)), progress)
 
 
-def _changed(scene: Handle, request: Request, progress: Progress) -> Flow[None]:
-    """Sends a change of the photos of a scene, and waits for the version with it."""
-    answer = yield from send(scene.policy, request)
-    scene.shown = parse(SceneStatus, _json(answer.body)), scene.shown[1]
+def _changed(scene: Handle, answer: Answer | None, progress: Progress) -> Flow[None]:
+    """Waits for the version with a change of the photos of a scene. None: its answer was lost."""
+    if answer:
+        scene.shown = parse(SceneStatus, _json(answer.body)), scene.shown[1]
     yield from wait(scene, progress)
     fault = scene.shown[0].growth.error
     if fault:
@@ -624,8 +635,9 @@ def _views(
         request = Request(
             "POST", path, json=_given({**body, "cameras": cameras[done:]}), stream=Multipart
         )
+        # Outside of `try`: it has its own tries.
+        yield from send(scene.policy, request)
         try:
-            yield from send(scene.policy, request)
             arrays: dict[Kind, NDArray[Any]] = {}
             while (part := (yield Read())) is not None:
                 headers, content = part
@@ -769,8 +781,9 @@ def export(
     params = _given({**_drawing(options), "format": format, "text": lines})
     request = Request("GET", f"/v1/scenes/{scene.id}/export", params=params, stream=Pieces)
     for again in range(scene.policy.retries + 1):
+        # Outside of `try`: it has its own tries.
+        yield from send(scene.policy, request)
         try:
-            yield from send(scene.policy, request)
             with part.open("wb") as file:
                 while (piece := (yield Read())) is not None:
                     file.write(piece)

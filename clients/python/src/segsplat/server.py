@@ -84,6 +84,8 @@ class _Process:
             late.cancel()
         if first.startswith("listening on "):
             return first.split()[2]
+        # One that says something else may live on.
+        self._child.kill()
         self._child.wait()
         told = self.log.read_text(errors="replace").splitlines()[-LOG_LINES:]
         self.stop()

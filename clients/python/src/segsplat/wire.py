@@ -153,15 +153,18 @@ def pause(policy: Policy, error: SegSplatError, again: int) -> Flow[None]:
 
 def meet(policy: Policy) -> Flow[None]:
     """Learns the limits of the server, and warns where it is of another version. A server that does
-    not say is left alone.
+    not say is left alone. One that cannot say now is asked again, as in any call.
     """
     policy.version_unseen = False
     try:
-        answer: Answer = yield Request("GET", "/v1/models")
+        answer = yield from send(policy, Request("GET", "/v1/models"))
         told = json.loads(answer.body)
         server = str(told["server_version"])
         policy.limits = parse(CallerLimits, told["limits"]) if told.get("limits") else None
-    except (SegSplatError, ValueError, KeyError, TypeError):
+    except (SegSplatError, ValueError, KeyError, TypeError) as error:
+        if isinstance(error, ConnectionLost) or (isinstance(error, SegSplatError) and error.retry):
+            policy.version_unseen = True
+            raise
         return
     if server.split(".")[:2] != __version__.split(".")[:2]:
         warnings.warn(
