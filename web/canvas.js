@@ -312,16 +312,12 @@ function flyTo(goal) {
 
 const touches = new Map();
 let pressed = null,
-  held = null,
-  asked = false;
-// Two fingers: both have moved when the next frame is drawn, and are read together. The camera is
-// that of the gesture's beginning, moved: what a frame saw of one finger alone does not stay.
+  held = null;
+// Two fingers, each time from where they and the camera began: one moves before the other.
 function gesture() {
-  asked = false;
-  const now = [...touches.values()];
-  if (!held || now.length !== 2) return;
-  const before = held.fingers;
-  state.camera = held.camera;
+  const [before, camera] = held,
+    now = [...touches.values()];
+  state.camera = camera;
   const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
   const high = $('stage').clientHeight,
     [dx, dy] = [0, 1].map((k) => (now[0][k] + now[1][k] - before[0][k] - before[1][k]) / 2);
@@ -346,8 +342,8 @@ function bindView() {
     touches.set(e.pointerId, [e.clientX, e.clientY]);
     const high = $('stage').clientHeight;
     if (touches.size === 2) {
-      held ||= { fingers: before, camera: state.camera };
-      asked ||= !!requestAnimationFrame(gesture);
+      held ||= [before, state.camera];
+      gesture();
     } else if (!pressed || Math.hypot(e.clientX - pressed[0], e.clientY - pressed[1]) > 4) {
       pressed = null;
       const how = $('drag').selectedIndex;
@@ -357,8 +353,8 @@ function bindView() {
     }
   });
   const end = (e) => {
-    gesture(); // the last movement before a finger goes
     touches.delete(e.pointerId);
+    held = null;
   };
   view.addEventListener('pointerup', (e) => {
     end(e);
