@@ -32,7 +32,7 @@ use crate::{
     refine::{RefineBudget, RefineOptions, RefinedVersion},
     scene::{
         PosedPhoto, Refine, RefineReport, RefineState, RefineStatus, Scene, SceneError, SceneId,
-        SceneStatus, Stage, Watch, unless_cancelled,
+        SceneStatus, Stage, Watch,
     },
     store::{Record, RefineOrder},
 };
@@ -125,6 +125,9 @@ impl Jobs {
     fn end_refinement(&self, id: &SceneId) -> Result<()> {
         self.queue.remove(id, Some(REFINE));
         self.running.stop(Reason::Cancelled, |job| job.kind == REFINE && job.scene == *id);
+        if self.replicas.is_lost(self, id)? {
+            return Ok(());
+        }
         self.records.apply(id, &Change::RefineEnded(None)).map(drop)
     }
 
@@ -250,7 +253,7 @@ impl Jobs {
         let (id, store) = (&job.scene, &self.parts.store);
         // No semantics are made of Gaussians that are replaced meanwhile.
         let _lock = self.lock(id.as_str(), job)?;
-        self.unless_grown_elsewhere(job)?;
+        self.unless_lost(job)?;
         let served = store.scene(id)?;
         let scene = store.put_version(version_of(start, &served, version)?)?;
         let published = self.records.apply(id, &Change::Published(&scene))?.after;
@@ -260,19 +263,10 @@ impl Jobs {
         Ok(())
     }
 
-    /// Ends the refinement of a scene whose photos another replica changes.
-    /// Fails with `cancelled`, and as the store does.
-    fn unless_grown_elsewhere(&self, job: &Job) -> Result<()> {
-        if self.replicas.grows_elsewhere(&self.parts.store, &job.scene)? {
-            job.stop(Reason::Cancelled);
-        }
-        unless_cancelled(&job.cancel)
-    }
-
     fn finish_refinement(&self, job: &Job, found: &RefineReport) -> Result<()> {
         let id = &job.scene;
         let _lock = self.lock(id.as_str(), job)?;
-        self.unless_grown_elsewhere(job)?;
+        self.unless_lost(job)?;
         let found = reported(self.record(id)?.status.cameras.len(), found);
         self.records.apply(id, &Change::RefineEnded(Some(&found)))?;
         tracing::info!(scene = %id, steps = found.steps, "refinement is over");

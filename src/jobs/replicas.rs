@@ -136,8 +136,21 @@ impl Replicas for OtherReplicas {
         Err(Error::new(ErrorCode::Overloaded, why).retry_after_s(1))
     }
 
-    fn grows_elsewhere(&self, store: &Store, id: &SceneId) -> Result<bool> {
-        Ok(store.grows_at(id)?.is_some_and(|replica| replica != self.name))
+    fn is_lost(&self, jobs: &Jobs, id: &SceneId) -> Result<bool> {
+        let (store, known) = (&jobs.parts.store, jobs.records.find(id));
+        let grows = self.grows_elsewhere(store, id)?;
+        let stored = store.record(id)?;
+        let grew = |stored: &Record, known: &Record| {
+            stored.growth.joined != known.growth.joined
+                || stored.status.version > known.status.version
+        };
+        let differs = stored.as_ref().zip(known.as_deref()).is_some_and(|(s, k)| grew(s, k));
+        if grows || differs {
+            tracing::info!(scene = %id, "another replica changes its photos");
+            self.release(id);
+            self.learn(jobs, id, stored);
+        }
+        Ok(grows || differs)
     }
 
     fn end_growing(&self, store: &Store, id: &SceneId) -> Result<()> {
@@ -174,6 +187,10 @@ impl Replicas for OtherReplicas {
 }
 
 impl OtherReplicas {
+    fn grows_elsewhere(&self, store: &Store, id: &SceneId) -> Result<bool> {
+        Ok(store.grows_at(id)?.is_some_and(|replica| replica != self.name))
+    }
+
     fn holds(&self, id: &SceneId) -> bool {
         self.held.lock().contains(id)
     }
@@ -308,9 +325,19 @@ impl OtherReplicas {
     fn grow_for_dead(&self, jobs: &Jobs, alive: &HashSet<String>) -> Result<()> {
         let store = &jobs.parts.store;
         for id in store.growing()? {
-            let Some(replica) = store.grows_at(&id)? else { continue };
-            let lives = replica == self.name || alive.contains(&replica);
-            if lives || store.claim(&id, &replica, &self.name)? != self.name {
+            let Some(mut replica) = store.grows_at(&id)? else { continue };
+            // From heir to heir: one that claimed it may be dead, too.
+            let lives = loop {
+                if replica == self.name || alive.contains(&replica) {
+                    break true;
+                }
+                let heir = store.claim(&id, &replica, &self.name)?;
+                if heir == self.name || heir == replica {
+                    break heir == replica;
+                }
+                replica = heir;
+            };
+            if lives {
                 continue;
             }
             let Some(record) = store.record(&id)? else { continue };

@@ -189,6 +189,9 @@ impl Jobs {
             labelled.into_iter().for_each(|labelled| self.uploads.keep_labelled(id, labelled));
             Ok(semantics)
         })?;
+        if record.status.state == SceneState::Done {
+            self.unless_lost(job)?;
+        }
         let (report, packed) = (semantics.report.clone(), store.pack_semantics(id, semantics)?);
         let sha256 = packed.file_sha256().to_owned();
         // A record without the file counts as no semantics, so both are kept at the same time.

@@ -90,8 +90,10 @@ pub(super) trait Replicas: Send + Sync {
         Ok(())
     }
 
-    /// Whether another process changes the photos of a scene.
-    fn grows_elsewhere(&self, _: &Store, _: &SceneId) -> Result<bool> {
+    /// Whether another process changes the photos of a finished scene, or has changed them since
+    /// this one read its record: then the scene is not held here any more.
+    /// Fails as the store does.
+    fn is_lost(&self, _: &Jobs, _: &SceneId) -> Result<bool> {
         Ok(false)
     }
 

@@ -17,7 +17,7 @@ use super::{
 };
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{SceneId, SceneState},
+    scene::{SceneId, SceneState, unless_cancelled},
     store::Record,
     telemetry::meter,
 };
@@ -85,6 +85,16 @@ impl Jobs {
             }
             _ => self.release(id),
         }
+    }
+
+    /// Ends a job on a finished scene whose photos another replica changes or has changed: what it
+    /// would keep is of the scene before.
+    /// Fails with `cancelled`, and as the store does.
+    pub(super) fn unless_lost(&self, job: &Job) -> Result<()> {
+        if self.replicas.is_lost(self, &job.scene)? {
+            job.stop(Reason::Cancelled);
+        }
+        unless_cancelled(&job.cancel)
     }
 
     /// What becomes of a job: its name in metrics.

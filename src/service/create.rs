@@ -3,6 +3,7 @@
 use std::{sync::Arc, time::Duration};
 
 use sha2::{Digest, Sha256};
+use tokio::sync::OwnedMutexGuard;
 
 use super::{
     refine,
@@ -78,13 +79,9 @@ impl Service {
         let keyed = idempotency_key.is_some();
         self.has_room(keyed)?;
         self.inner.memory.admit(upload.memory_bytes())?;
-        let one_at_a_time = match &idempotency_key {
-            Some(key) => Some(self.inner.key_lock(key).lock().await),
-            None => None,
-        };
+        let turn = self.inner.turn_of(idempotency_key.as_deref()).await;
         let record = |record| Record { options, idempotency_key, request_id, ..record };
-        let (id, replayed) = self.submit(upload, record).await?;
-        drop(one_at_a_time);
+        let (id, replayed) = self.submit(upload, record, turn).await?;
         if let Some(wait) = wait {
             let unknown = (!keyed && !replayed).then(|| id.clone());
             let mut waiting = Waiting { service: self.clone(), id: unknown };
@@ -140,17 +137,21 @@ impl Service {
         &self,
         upload: Upload,
         record: impl FnOnce(Record) -> Record + Send + 'static,
+        turn: Turn,
     ) -> Result<(SceneId, bool)> {
         let (inner, caller) = (Arc::clone(&self.inner), self.caller.clone());
         let permit = Arc::clone(&inner.reading).acquire_owned().await;
         let permit = permit.map_err(|e| Error::internal("no upload is read now").caused_by(e))?;
         blocking(move || {
-            let _permit = permit;
+            let _until_done = (permit, turn);
             inner.submit_here(upload, record, &caller)
         })
         .await?
     }
 }
+
+/// Held by a call with an idempotency key until its work is done.
+pub(super) type Turn = Option<OwnedMutexGuard<()>>;
 
 impl Shared {
     fn submit_here(
@@ -179,10 +180,11 @@ impl Shared {
         Ok((queued, replayed))
     }
 
-    /// Held by a call with this key, so that two of them cannot both be the first.
-    pub(super) fn key_lock(&self, key: &str) -> &tokio::sync::Mutex<()> {
-        let place = Sha256::digest(key)[0] as usize % KEY_LOCKS;
-        &self.key_locks[place]
+    /// Waits until no other call with this key is at work, so that two of them cannot both be the
+    /// first. What the call does keeps it, also where the caller has gone.
+    pub(super) async fn turn_of(&self, key: Option<&str>) -> Turn {
+        let place = Sha256::digest(key?)[0] as usize % KEY_LOCKS;
+        Some(Arc::clone(&self.key_locks[place]).lock_owned().await)
     }
 }
 

@@ -25,20 +25,16 @@ impl Service {
         check_key(idempotency_key.as_deref())?;
         let scene = self.scene_of_photos(id).await?;
         self.inner.memory.admit(upload.memory_bytes())?;
-        let one_at_a_time = match &idempotency_key {
-            Some(key) => Some(self.inner.key_lock(key).lock().await),
-            None => None,
-        };
+        let turn = self.inner.turn_of(idempotency_key.as_deref()).await;
         let inner = Arc::clone(&self.inner);
         let permit = Arc::clone(&inner.reading).acquire_owned().await;
         let permit = permit.map_err(|e| Error::internal("no upload is read now").caused_by(e))?;
         let id = scene.id().clone();
         let replayed = blocking(move || {
-            let _permit = permit;
+            let _until_done = (permit, turn);
             inner.jobs.add_photos(&id, upload, idempotency_key)
         })
         .await??;
-        drop(one_at_a_time);
         let status = self.changed(scene.id(), wait).await?;
         Ok(Created { status, replayed })
     }

@@ -79,7 +79,7 @@ pub(super) struct Shared {
     pub(super) watchers: Arc<Semaphore>,
     /// Permits to run networks.
     pub(super) inferences: Arc<Semaphore>,
-    pub(super) key_locks: [tokio::sync::Mutex<()>; KEY_LOCKS],
+    pub(super) key_locks: [Arc<tokio::sync::Mutex<()>>; KEY_LOCKS],
     pub(super) memory: Arc<Memory>,
     /// Of the scene whose packed form was read last.
     pub(super) coarse: Arc<LastCoarse>,

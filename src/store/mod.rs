@@ -80,14 +80,18 @@ pub struct Store {
     shared: bool,
     /// Finished scenes, by the bytes of their arrays.
     cache: Cache<SceneId, Arc<Scene>>,
-    /// One lock a scene being read, so that many callers read it once.
-    reading: Mutex<HashMap<SceneId, Arc<Mutex<()>>>>,
+    /// One lock a scene that is read or put: many callers read it once, and none brings back into
+    /// memory what was replaced while it read.
+    turns: Mutex<HashMap<SceneId, Arc<Mutex<()>>>>,
     /// Scenes whose upload and first record are being written: a sweep leaves them alone.
     arriving: Mutex<HashSet<SceneId>>,
     /// Lists of the files of uploads that are being received: a sweep leaves these alone.
     receiving: Mutex<HashSet<Name>>,
     /// Scenes deleted here: what a job still writes of one is removed again.
     gone: Mutex<HashMap<SceneId, Instant>>,
+    /// What is put and removed to see whether things are kept. Always the same: one that comes late
+    /// stays alone.
+    probe: Name,
     /// Dropped with the store: another process may then use the folder.
     _lock: Option<fs::File>,
 }
@@ -138,7 +142,7 @@ impl Store {
     /// Looks whether the store keeps things again.
     /// Fails with `store_unavailable` where it does not.
     pub(crate) fn probe(&self) -> Result<()> {
-        self.objects.probe(Name::from(format!("{PROBE}/{}", new_id()?)))
+        self.objects.probe(self.probe.clone())
     }
 
     /// Looks whether there is room for what waits for it, before more is taken in.
@@ -285,11 +289,13 @@ impl Store {
         let mut file = Vec::with_capacity(scene.gaussians.size_bytes() as usize + (64 << 10));
         let sha256 = write_scene(&mut file, &scene)
             .map_err(|e| Error::internal("the scene cannot be packed").caused_by(e))?;
-        let kept = put(of(&id, SCENE), file)?;
-        self.unless_deleted(&id)?;
-        let scene = Arc::new(kept.unwrap_or(Scene { sha256, ..scene }));
-        self.keep(Arc::clone(&scene));
-        Ok(scene)
+        self.in_turn(&id, || {
+            let kept = put(of(&id, SCENE), file)?;
+            self.unless_deleted(&id)?;
+            let scene = Arc::new(kept.unwrap_or(Scene { sha256, ..scene }));
+            self.keep(Arc::clone(&scene));
+            Ok(scene)
+        })
     }
 
     /// Packs the semantics of a scene, to be put.
@@ -311,11 +317,13 @@ impl Store {
     /// Fails with `store_unavailable`; `scene_not_found` when the scene was deleted.
     pub(crate) fn put_semantics(&self, packed: PackedSemantics) -> Result<Arc<Scene>> {
         let PackedSemantics { scene, file } = packed;
-        let id = &scene.meta.id;
-        self.objects.put("keep the scene's semantics", of(id, SEMANTICS), file)?;
-        self.unless_deleted(id)?;
-        self.keep(Arc::clone(&scene));
-        Ok(scene)
+        let id = scene.meta.id.clone();
+        self.in_turn(&id, || {
+            self.objects.put("keep the scene's semantics", of(&id, SEMANTICS), file)?;
+            self.unless_deleted(&id)?;
+            self.keep(Arc::clone(&scene));
+            Ok(scene)
+        })
     }
 
     /// A finished scene, from memory or the store, with its semantics where they were made; every
@@ -328,13 +336,23 @@ impl Store {
         if let Some(scene) = self.cache.find(id) {
             return Ok(scene);
         }
-        let lock = Arc::clone(self.reading.lock().entry(id.clone()).or_default());
-        let scene = {
-            let _one_reader = lock.lock();
-            self.cache.find(id).map_or_else(|| self.read_scene(id), Ok)
+        self.in_turn(id, || self.cache.find(id).map_or_else(|| self.read_scene(id), Ok))
+    }
+
+    /// Does what one call at a time may do with a scene.
+    fn in_turn<T>(&self, id: &SceneId, work: impl FnOnce() -> T) -> T {
+        let turn = Arc::clone(self.turns.lock().entry(id.clone()).or_default());
+        let done = {
+            let _one = turn.lock();
+            work()
         };
-        self.reading.lock().remove(id);
-        scene
+        let mut turns = self.turns.lock();
+        drop(turn);
+        // Nobody else waits for it.
+        if turns.get(id).is_some_and(|turn| Arc::strong_count(turn) == 1) {
+            turns.remove(id);
+        }
+        done
     }
 
     /// The scene where it is in memory. Never blocks on the store.
@@ -373,7 +391,8 @@ impl Store {
     }
 
     /// The scene with the semantics that are kept beside it, if any are and they are sound. A
-    /// version that was made after them has their entries itself.
+    /// version that was made after them has their entries itself. Semantics of other Gaussians stay
+    /// where they are: they are put before the version that they belong to.
     fn with_its_semantics(&self, mut scene: Scene) -> Result<Scene> {
         let id = scene.meta.id.clone();
         let entries_of = std::mem::take(&mut scene.semantics_sha256);
@@ -383,15 +402,21 @@ impl Store {
         }
         let file = self.objects.get("read the scene's semantics", of(&id, SEMANTICS))?;
         let Some(file) = file else { return Ok(scene) };
-        let checked = read_semantics(&file, &id).and_then(|(semantics, sha256)| {
-            let index = own.filter(|_| sha256 == entries_of).unwrap_or(semantics.index);
-            let with = scene.with_semantics(Arc::new(Semantics { index, ..semantics }))?;
-            Ok(Scene { semantics_sha256: sha256, ..with })
-        });
-        checked.or_else(|error| {
-            self.quarantine(&id, SEMANTICS, &error);
-            Ok(scene)
-        })
+        let (semantics, sha256) = match read_semantics(&file, &id) {
+            Ok(read) => read,
+            Err(error) => {
+                self.quarantine(&id, SEMANTICS, &error);
+                return Ok(scene);
+            }
+        };
+        let index = own.filter(|_| sha256 == entries_of).unwrap_or(semantics.index);
+        match scene.with_semantics(Arc::new(Semantics { index, ..semantics })) {
+            Ok(with) => Ok(Scene { semantics_sha256: sha256, ..with }),
+            Err(error) => {
+                tracing::warn!(scene = %id, %error, "its semantics are of another version");
+                Ok(scene)
+            }
+        }
     }
 
     /// Fails with `other_version` where the semantics that are kept of a scene are another
@@ -406,8 +431,10 @@ impl Store {
 
     /// Forgets the semantics of a scene, as when the networks that made them are not loaded now.
     pub(crate) fn drop_semantics(&self, id: &SceneId) -> Result<()> {
-        self.cache.remove(id);
-        self.objects.delete("forget the scene's semantics", of(id, SEMANTICS)).map(drop)
+        self.in_turn(id, || {
+            self.cache.remove(id);
+            self.objects.delete("forget the scene's semantics", of(id, SEMANTICS)).map(drop)
+        })
     }
 
     /// Removes everything of a scene. It stays removed even if power fails.

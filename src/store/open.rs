@@ -10,12 +10,12 @@ use std::{
 use fs_err as fs;
 use object_store::{
     ClientOptions, ObjectStore, RetryConfig, aws::AmazonS3Builder, local::LocalFileSystem,
-    prefix::PrefixStore,
+    path::Path as Name, prefix::PrefixStore,
 };
 use parking_lot::Mutex;
 
 use super::{
-    Cache, Objects, PROBE, Record, SCENE, STATUS, Store, UPLOAD, aside, of, pending, record,
+    Cache, Objects, PROBE, Record, SCENE, STATUS, Store, UPLOAD, aside, new_id, of, pending, record,
 };
 use crate::{
     config::Config,
@@ -117,10 +117,11 @@ impl Store {
             objects: Arc::new(objects),
             shared,
             cache: Cache::new(limits.cache_bytes_max),
-            reading: Mutex::default(),
+            turns: Mutex::default(),
             arriving: Mutex::default(),
             receiving: Mutex::default(),
             gone: Mutex::default(),
+            probe: Name::from(format!("{PROBE}/{}", new_id()?)),
             _lock: lock,
         };
         let records = if shared {
@@ -223,10 +224,16 @@ pub(super) fn sound(id: &SceneId, file: &[u8]) -> Option<Record> {
 /// of another version is told as a failure, and stays where it is for that version.
 pub(super) fn find_record(store: &Store, id: &SceneId) -> Result<Option<Record>> {
     let what = "read a status";
-    let mut found = store.objects.get(what, of(id, STATUS))?;
-    let is_status = found.is_some();
+    let status = || store.objects.get(what, of(id, STATUS));
+    let mut found = status()?;
+    let mut is_status = found.is_some();
     if !is_status {
         found = store.objects.get(what, pending(id))?;
+    }
+    if found.is_none() {
+        // A scene that ends has its status before it pends no more.
+        found = status()?;
+        is_status = found.is_some();
     }
     let Some(file) = found else { return Ok(None) };
     let error = match record::unseal(&file) {

@@ -77,11 +77,16 @@ impl Store {
 
     /// Lets `replica` change the photos of a scene, unless another does; gives the one that does.
     pub(crate) fn begin_growing(&self, id: &SceneId, replica: &str) -> Result<String> {
-        let (what, path) = ("change the photos of a scene", growing(id));
-        if self.objects.create(what, path, replica.as_bytes().to_vec())? {
-            return Ok(replica.to_owned());
+        let what = "change the photos of a scene";
+        loop {
+            if self.objects.create(what, growing(id), replica.as_bytes().to_vec())? {
+                return Ok(replica.to_owned());
+            }
+            // None where the other one has just ended.
+            if let Some(at_work) = self.grows_at(id)? {
+                return Ok(at_work);
+            }
         }
-        Ok(self.grows_at(id)?.unwrap_or_else(|| replica.to_owned()))
     }
 
     /// The replica that changes the photos of a scene.

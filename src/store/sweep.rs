@@ -10,11 +10,13 @@ use std::{collections::HashSet, time::Duration};
 
 use object_store::path::Path as Name;
 
-use super::{STATUS, Store, of, pending, received};
+use super::{PROBE, STATUS, Store, of, pending, received};
 use crate::{error::Result, scene::SceneId};
 
 /// What a sweep is, in an error.
 const SWEEP: &str = "be swept";
+/// Age from which the probe of another process is one that it left.
+const PROBE_OLD: Duration = Duration::from_hours(1);
 
 impl Store {
     /// Removes objects of scenes that do not exist, and tombstones older than `buried`: by then
@@ -42,6 +44,12 @@ impl Store {
                     self.objects.delete(SWEEP, object.path)?;
                     removed += 1;
                 }
+            }
+        }
+        for object in self.objects.list(SWEEP, PROBE)? {
+            if object.path != self.probe && object.age >= PROBE_OLD {
+                self.objects.delete(SWEEP, object.path)?;
+                removed += 1;
             }
         }
         let claims = self.objects.list(SWEEP, "claims")?;

@@ -10,7 +10,7 @@ use std::{
 };
 
 use futures_util::StreamExt;
-use object_store::{ObjectStore, local::LocalFileSystem};
+use object_store::{ObjectStore, local::LocalFileSystem, memory::InMemory};
 use segsplat::{
     error::ErrorCode,
     sample::{self, SampleOptions},
@@ -474,6 +474,61 @@ async fn what_is_deleted_does_not_come_back_by_a_call_that_was_given_up() {
     let server = server.restart().await;
     let after = server.service.get(&id).await.map(|status| status.state);
     assert_eq!(after.map_err(|error| error.code()), Err(ErrorCode::SceneNotFound));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_caller_that_goes_and_comes_back_with_its_key_has_one_scene() {
+    let faults = Arc::new(FaultStore::new(Arc::new(InMemory::new()), Duration::ZERO));
+    let place = StoreLocation::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
+    let server = TestServer::at(&place, |_, _| {}).await;
+    faults.plan(|what, path| {
+        (what == "put" && path.as_ref().ends_with("upload.segsplat")).then_some(Wrong::Held)
+    });
+    let create = || {
+        let (service, key) = (server.service.clone(), Some("one".to_owned()));
+        let request = CreateScene { upload: upload(1), idempotency_key: key, ..request(1) };
+        tokio::spawn(async move { service.create_scene(request).await })
+    };
+    let first = create();
+    let is_held = async || (faults.held.load(Ordering::Acquire) > 0).then_some(());
+    eventually("its photos are being kept", is_held).await;
+    first.abort();
+    let _ = first.await;
+    let second = create();
+    // Enough for a second call that does not wait for the work of the first.
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    faults.let_go();
+    let second = second.await.unwrap().unwrap();
+    assert!(second.replayed, "it is the scene of the first call");
+    assert_eq!(listed(&server.service).await, HashSet::from([second.status.id]));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_scene_that_ends_while_another_replica_reads_it_is_found() {
+    let objects = Arc::new(InMemory::new());
+    let networks = Arc::new(WallNetworks::default());
+    networks.hold.store(true, Ordering::Release);
+    let given = Arc::clone(&networks);
+    let place = StoreLocation::Shared(Arc::clone(&objects) as Arc<dyn ObjectStore>);
+    let one = TestServer::at(&place, |_, parts| parts.scenes = given).await;
+    let faults = Arc::new(FaultStore::new(objects, Duration::from_millis(500)));
+    let place = StoreLocation::Shared(Arc::clone(&faults) as Arc<dyn ObjectStore>);
+    let other = TestServer::at(&place, |config, _| config.limits.record_fresh_ms = 0).await;
+    let request = CreateScene { wait: None, ..request(1) };
+    let id = one.service.create_scene(request).await.unwrap().status.id;
+    faults.plan(|what, path| {
+        (what == "get" && path.as_ref().starts_with("pending/")).then_some(Wrong::Stalls)
+    });
+    let reader = {
+        let (service, id) = (other.service.clone(), id.clone());
+        tokio::spawn(async move { service.get(&id).await })
+    };
+    let reads = async || (faults.wrongs.load(Ordering::Acquire) > 0).then_some(());
+    eventually("it is being read", reads).await;
+    networks.hold.store(false, Ordering::Release);
+    one.finished(&id).await;
+    let found = reader.await.unwrap();
+    assert_eq!(found.unwrap().state, SceneState::Done);
 }
 
 #[tokio::test(flavor = "multi_thread")]

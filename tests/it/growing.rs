@@ -1,8 +1,12 @@
 //! Scenes whose photos change: what joins and leaves is in the next version whole, the one before
 //! is served until then, and what was acknowledged lasts.
 
-use std::sync::{Arc, LazyLock, atomic::Ordering};
+use std::{
+    sync::{Arc, LazyLock, atomic::Ordering},
+    time::Duration,
+};
 
+use object_store::{ObjectStoreExt, memory::InMemory, path::Path};
 use reqwest::StatusCode;
 use segsplat::{
     api::grpc::pb::{self, scene_service_client::SceneServiceClient},
@@ -20,6 +24,7 @@ use segsplat::{
         SceneStatus, SemanticsMode, Stage, Upload, UploadCameras, Watch,
     },
     service::CreateScene,
+    store::StoreLocation,
 };
 use serde_json::{Value, json};
 
@@ -27,6 +32,7 @@ use crate::{
     common::{
         client,
         doors::{adding, channel, form},
+        faults::{FaultStore, Wrong},
         meaning::PhotoMeaning,
         opened,
         process::{eventually, photos_of},
@@ -541,4 +547,102 @@ async fn the_networks_run_for_what_is_new_alone() {
     let (status, left) = remove(&server, &id, &name).await;
     assert_eq!(status, StatusCode::OK, "{left}");
     assert_eq!(ms(&left, "geometry"), None, "no network runs for a photo that leaves");
+}
+
+/// Two servers on one store; the networks of the first wait while they are told to.
+async fn replicas(place: [StoreLocation; 2]) -> (TestServer, TestServer, Arc<WallNetworks>) {
+    let networks = Arc::new(WallNetworks::default());
+    let given = Arc::clone(&networks);
+    let one = TestServer::at(&place[0], |config, parts| {
+        config.limits.record_fresh_ms = 0;
+        parts.scenes = given;
+    });
+    let other = TestServer::at(&place[1], |config, _| config.limits.record_fresh_ms = 0);
+    (one.await, other.await, networks)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn photos_that_joined_at_another_replica_outlive_a_refinement_here() {
+    for is_ended in [true, false] {
+        let place = StoreLocation::Shared(Arc::new(InMemory::new()));
+        let (one, other, networks) = replicas([place.clone(), place]).await;
+        let id = made(&one, &[0, 1, 2, 3], SceneOptions::default()).await.id;
+        networks.hold.store(true, Ordering::Release);
+        let before = networks.calls.load(Ordering::Acquire);
+        one.service.refine(&id, Refine::Ms(600_000)).await.unwrap();
+        let is_held = async || (networks.calls.load(Ordering::Acquire) > before).then_some(());
+        eventually("its refinement has begun", is_held).await;
+        assert_eq!(files(&add(&other, &id, &[4]).await).len(), 5);
+        if is_ended {
+            one.service.refine(&id, Refine::Off).await.unwrap();
+        }
+        networks.hold.store(false, Ordering::Release);
+        let is_over = async || {
+            let state = one.service.get(&id).await.unwrap().refinement.state;
+            matches!(state, RefineState::None | RefineState::Done).then_some(())
+        };
+        eventually("its refinement is over", is_over).await;
+        for server in [&one, &other] {
+            let scene = server.service.get(&id).await.unwrap();
+            assert_eq!(scene.cameras.len(), 5, "ended {is_ended}: {scene:?}");
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_change_of_photos_is_claimed_where_another_has_just_ended() {
+    let objects = Arc::new(InMemory::new());
+    let faults = Arc::new(FaultStore::new(Arc::clone(&objects) as _, Duration::from_millis(500)));
+    let place = [Arc::clone(&faults) as _, Arc::clone(&objects) as _].map(StoreLocation::Shared);
+    let (one, _other, networks) = replicas(place).await;
+    let id = made(&one, &[0, 1, 2, 3], SceneOptions::default()).await.id;
+    let claim = Path::from(format!("growing/{id}"));
+    objects.put(&claim, "another".into()).await.unwrap();
+    networks.hold.store(true, Ordering::Release);
+    let path = claim.clone();
+    faults.plan(move |what, at| (what == "get" && *at == path).then_some(Wrong::Stalls));
+    let ends = async {
+        let reads = async || (faults.wrongs.load(Ordering::Acquire) > 0).then_some(());
+        eventually("the claim is being read", reads).await;
+        objects.delete(&claim).await.unwrap();
+    };
+    let photos = some(&[4]);
+    let ((status, _, answer), ()) = tokio::join!(send(&one, &id, &photos, 0, None), ends);
+    assert_eq!(status, StatusCode::ACCEPTED, "{answer}");
+    assert!(objects.head(&claim).await.is_ok(), "nobody else may change its photos now");
+    networks.hold.store(false, Ordering::Release);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn semantics_that_came_before_their_version_stay() {
+    let (server, _) = held_server().await;
+    let options = SceneOptions { semantics: SemanticsMode::Eager, ..SceneOptions::default() };
+    let id = made(&server, &[0, 1, 2, 3], options).await.id;
+    let folder = server.data_dir().join("scenes").join(id.as_str());
+    let before = std::fs::read(folder.join("scene.segsplat")).unwrap();
+    add(&server, &id, &[4]).await;
+    let kept = std::fs::read(folder.join("semantics.segsplat")).unwrap();
+    // As a reader finds them that comes between the two.
+    std::fs::write(folder.join("scene.segsplat"), before).unwrap();
+    let server = server.restart().await;
+    assert_eq!(picture(&server, &id, "from=0").await.0, StatusCode::OK);
+    assert_eq!(std::fs::read(folder.join("semantics.segsplat")).unwrap(), kept);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_claim_on_photos_is_followed_from_heir_to_heir() {
+    let objects = Arc::new(InMemory::new());
+    let place = StoreLocation::Shared(Arc::clone(&objects) as _);
+    let server = TestServer::at(&place, |config, _| {
+        (config.limits.replica_beat_ms, config.limits.replica_lease_ms) = (50, 200);
+    });
+    let server = server.await;
+    let id = made(&server, &[0, 1, 2], SceneOptions::default()).await.id;
+    // Neither the one that changed its photos nor its heir is there any more.
+    let [growing, claim] = [format!("growing/{id}"), format!("claims/{id}.first")].map(Path::from);
+    objects.put(&claim, "second".into()).await.unwrap();
+    objects.put(&growing, "first".into()).await.unwrap();
+    let ended = async || objects.head(&growing).await.is_err().then_some(());
+    eventually("nobody changes its photos", ended).await;
+    assert_eq!(files(&add(&server, &id, &[3]).await).len(), 4);
 }

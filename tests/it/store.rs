@@ -1,7 +1,14 @@
 //! The store: files come back bit for bit, are whole or absent, and are put aside when they are
 //! bad; PLY out and in.
 
-use std::{collections::HashSet, fs, io::Cursor, path::Path, sync::Arc, time::Duration};
+use std::{
+    collections::HashSet,
+    fs,
+    io::Cursor,
+    path::Path,
+    sync::{Arc, atomic::Ordering},
+    time::{Duration, SystemTime},
+};
 
 use glam::DVec3;
 use object_store::{memory::InMemory, path::Path as Name};
@@ -428,6 +435,42 @@ fn a_sweep_leaves_an_upload_whose_record_is_on_its_way() {
         put.join().unwrap().unwrap();
     });
     store.upload(&id(1)).unwrap();
+}
+
+#[test]
+fn a_reader_brings_no_replaced_version_back_into_memory() {
+    let inner = Arc::new(InMemory::new());
+    let put_first = Store::open(&StoreLocation::Own(Arc::clone(&inner) as _), &Limits::default());
+    put_first.unwrap().0.put_scene(scene(1, 5, 0)).unwrap();
+    let faults = Arc::new(FaultStore::new(inner, Duration::from_millis(400)));
+    let place = StoreLocation::Own(Arc::clone(&faults) as _);
+    let (store, _) = Store::open(&place, &Limits::default()).unwrap();
+    faults.plan(|what, path| {
+        (what == "get" && path.as_ref().ends_with("scene.segsplat")).then_some(Wrong::Late)
+    });
+    std::thread::scope(|scope| {
+        let reader = scope.spawn(|| store.scene(&id(1)));
+        while faults.wrongs.load(Ordering::Acquire) == 0 {
+            std::thread::yield_now();
+        }
+        store.put_version(scene(1, 9, 0)).unwrap();
+        reader.join().unwrap().unwrap();
+    });
+    assert_eq!(store.scene(&id(1)).unwrap().gaussians.len(), 9, "the version that was put last");
+}
+
+#[test]
+fn a_probe_that_was_left_goes_when_it_is_old() {
+    let folder = tempfile::tempdir().unwrap();
+    let (store, _) = open(folder.path());
+    let probes = folder.path().join("probe");
+    fs::create_dir_all(&probes).unwrap();
+    for (name, hours) in [("old", 2), ("new", 0)] {
+        let file = fs::File::create(probes.join(name)).unwrap();
+        file.set_modified(SystemTime::now() - Duration::from_hours(hours)).unwrap();
+    }
+    assert_eq!(store.sweep(Duration::ZERO).unwrap(), 1);
+    assert!(!probes.join("old").exists() && probes.join("new").exists());
 }
 
 #[test]

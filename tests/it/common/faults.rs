@@ -30,6 +30,8 @@ pub(crate) enum Wrong {
     Tears,
     /// It hangs, and does its work long after its caller has gone.
     Stalls,
+    /// It reads at once, and answers late.
+    Late,
     /// It hangs until the test lets go.
     Held,
     /// There is no room.
@@ -127,7 +129,7 @@ impl ObjectStore for FaultStore {
     ) -> Result<PutResult> {
         use std::io::ErrorKind;
         match self.wrong("put", location) {
-            None => self.inner.put_opts(location, payload, opts).await,
+            None | Some(Wrong::Late) => self.inner.put_opts(location, payload, opts).await,
             Some(Wrong::Fails) => Err(error(ErrorKind::ConnectionReset)),
             Some(Wrong::Full) => Err(error(ErrorKind::StorageFull)),
             Some(Wrong::Held) => {
@@ -173,6 +175,11 @@ impl ObjectStore for FaultStore {
                 tokio::time::sleep(self.stall).await;
                 self.inner.get_opts(location, options).await
             }
+            Some(Wrong::Late) => {
+                let found = self.inner.get_opts(location, options).await;
+                tokio::time::sleep(self.stall).await;
+                found
+            }
             Some(_) => Err(error(std::io::ErrorKind::ConnectionReset)),
         }
     }
@@ -185,7 +192,8 @@ impl ObjectStore for FaultStore {
         let inner = Arc::clone(&self.inner);
         let wrong = self.wrong("delete", &Path::default());
         match wrong {
-            None | Some(Wrong::Full | Wrong::NoFolder | Wrong::Tears | Wrong::Stalls) => {
+            None
+            | Some(Wrong::Full | Wrong::NoFolder | Wrong::Tears | Wrong::Stalls | Wrong::Late) => {
                 inner.delete_stream(locations)
             }
             Some(Wrong::Held) => {
