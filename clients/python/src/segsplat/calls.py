@@ -125,6 +125,7 @@ def create(
 ) -> Flow[Shown]:
     """Uploads photos. A second try never makes a second scene: both carry one key."""
     if not policy.limits:
+        _check(source, options.get("cameras") == "solve")
         yield from meet(policy)
     params = {name.removesuffix("_"): value for name, value in options.items()}
     if isinstance(words := params.get("ignore"), str):
@@ -187,6 +188,16 @@ def parts_of(
     # COLMAP says the size of its photos, so they may be made smaller. Not all layouts do.
     is_colmap = any(Path(part.name).name in ("cameras.bin", "cameras.txt") for part in cameras_of)
     return [*fit(photos, limits, is_colmap)[0], *cameras_of]
+
+
+def _check(source: Source, solve: bool = False) -> None:
+    """Says what is wrong with a source before a server is asked. Not of a video, whose frames take
+    long."""
+    if isinstance(source, Mapping) or Path(source).suffix.lower() not in VIDEOS:
+        with warnings.catch_warnings():
+            # They come with the parts that are sent.
+            warnings.simplefilter("ignore")
+            parts_of(source, None, solve)
 
 
 def masks_in(folder: str | Path | None) -> list[Part]:
@@ -450,6 +461,7 @@ def add(
     progress: as `wait` takes it.
     """
     if not scene.policy.limits:
+        _check(source)
         yield from meet(scene.policy)
     request = Request(
         "POST",
